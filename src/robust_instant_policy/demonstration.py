@@ -1,0 +1,73 @@
+"""What the camera saw and what the person did."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robust_instant_policy.errors import InvalidValueError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One RGB-D image with its calibrated camera.
+
+    ``rgb (H, W, 3)`` uint8; ``depth (H, W)`` float32 metres along the optical axis, NaN or 0 where there is
+    no reading; ``intrinsics (3, 3)``; ``camera_pose (4, 4)`` camera to world, OpenCV axes.
+    Raises `InvalidValueError` for anything else.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    intrinsics: FloatArray
+    camera_pose: FloatArray
+
+    def __post_init__(self) -> None:
+        rgb = np.asarray(self.rgb)
+        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+            raise InvalidValueError(f"rgb must be (H, W, 3) uint8, got {rgb.shape} {rgb.dtype}")
+        depth = np.asarray(self.depth, dtype=np.float32)
+        if depth.shape != rgb.shape[:2]:
+            raise InvalidValueError(f"depth must be {rgb.shape[:2]} like the image, got {depth.shape}")
+        intrinsics = np.asarray(self.intrinsics, dtype=np.float64)
+        camera_pose = np.asarray(self.camera_pose, dtype=np.float64)
+        if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all():
+            raise InvalidValueError(f"intrinsics must be (3, 3) and finite, got {intrinsics.shape}")
+        if camera_pose.shape != (4, 4) or not np.isfinite(camera_pose).all():
+            raise InvalidValueError(f"camera_pose must be (4, 4) and finite, got {camera_pose.shape}")
+        rotation = camera_pose[:3, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+            raise InvalidValueError("camera_pose (4, 4) must hold a proper rotation")
+        for name, value in (
+            ("rgb", rgb),
+            ("depth", depth),
+            ("intrinsics", intrinsics),
+            ("camera_pose", camera_pose),
+        ):
+            object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration:
+    """One episode: the observation at its start, the gripper's trajectory, and what is known about it.
+
+    ``rate_hz`` is the recording rate, so the episode lasted ``(len(trajectory) - 1) / rate_hz`` seconds.
+    ``info`` holds further facts worth keeping (strings and numbers only).
+    """
+
+    observation: Observation
+    trajectory: Trajectory
+    rate_hz: float
+    task: str = ""
+    seed: int | None = None
+    info: Mapping[str, str | float | int] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def seconds(self) -> float:
+        return (len(self.trajectory) - 1) / self.rate_hz

@@ -1,0 +1,64 @@
+"""Errors a user may meet. Each is one line that says what is wrong and what to do next.
+
+The command turns them into exit codes: 2 for wrong usage, 1 for everything else that broke.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class RipError(Exception):
+    """Base of all errors of this package."""
+
+    exit_code = 1
+
+
+class UsageError(RipError):
+    """The call or the command line asks for something that does not exist."""
+
+    exit_code = 2
+
+
+class UnknownNameError(UsageError):
+    """A task, method or other named thing that is not there; names the ones that are."""
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]):
+        super().__init__(f"unknown {kind} {name!r}; known: {', '.join(known)}")
+        self.kind, self.name = kind, name
+
+
+class MissingExtraError(RipError):
+    """An optional dependency is not installed."""
+
+    def __init__(self, package: str, extra: str):
+        super().__init__(f"{package} is not installed; run: pip install 'robust-instant-policy[{extra}]'")
+        self.package, self.extra = package, extra
+
+
+class InvalidValueError(RipError, ValueError):
+    """An array or number that breaks its contract; names the argument and its shape."""
+
+
+class DatasetError(RipError):
+    """A demonstrations folder that is missing, empty, half-written or of another task."""
+
+
+class KeypointError(RipError):
+    """The images show too little in common, or too little of it has depth."""
+
+
+class PlanningError(RipError):
+    """The language model gave too few usable answers to make a plan."""
+
+
+class ModelError(RipError):
+    """A language model or network that cannot be loaded or reached."""
+
+
+class RendererError(RipError):
+    """No usable renderer for the simulator's camera."""
+
+
+class UnreachableError(RipError):
+    """A trajectory that the arm must not or cannot follow."""

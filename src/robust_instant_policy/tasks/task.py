@@ -1,0 +1,73 @@
+"""The contract between tasks and everything above them. Tasks know no method; methods know no task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.trajectory import Trajectory
+
+Image = NDArray[np.uint8]
+FrameSink = Callable[[Image], None]
+
+
+@dataclass(frozen=True)
+class Execution:
+    """What happened when a trajectory was executed.
+
+    ``failure`` says in words why it failed and is empty on success; ``seconds`` is simulated (or real) time;
+    ``tracking_error`` the largest distance in metres between the commanded and the reached palm point.
+    """
+
+    success: bool
+    failure: str
+    seconds: float
+    tracking_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """One try of a demonstrator, at the recording rate; ``images (T, H, W, 3)`` uint8 where asked for."""
+
+    demonstration: Demonstration
+    success: bool
+    failure: str
+    images: Image | None = field(default=None, repr=False)
+
+
+class Task(Protocol):
+    """A scene, a robot in it, and a person who can show what to do.
+
+    ``workspace (2, 3)`` are the lower and upper corner, in metres, of the volume in which the arm works;
+    keypoints outside it mean nothing. ``record_hz`` and ``execute_hz`` are the rates of demonstrations and
+    of the waypoints played back.
+    """
+
+    name: str
+    description: str
+    record_hz: float
+    execute_hz: float
+    workspace: FloatArray
+
+    def reset(self, seed: int) -> Observation:
+        """Draw the scene of ``seed`` and photograph it; the same seed gives the same scene and image."""
+        ...
+
+    def execute(self, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
+        """Run ``trajectory`` in the scene of the last `reset`; ``on_frame`` receives video frames.
+
+        Raises `UnreachableError`, before anything moves, for a trajectory the arm cannot follow safely.
+        """
+        ...
+
+    def demonstrate(self, seed: int, with_images: bool = False) -> Attempt:
+        """Let the demonstrator try the scene of ``seed``, in its own manner for that seed."""
+        ...
+
+    def close(self) -> None: ...
