@@ -32,20 +32,13 @@ class Trajectory:
     def __post_init__(self) -> None:
         actions = np.array(self.actions, dtype=np.float64)
         times = np.array(self.times, dtype=np.float64)
-        if (
-            actions.ndim != 2
-            or actions.shape[0] == 0
-            or actions.shape[1] == 0
-            or actions.shape[1] % ACTION_DIM
-        ):
+        if actions.ndim != 2 or actions.shape[0] == 0 or actions.shape[1] == 0 or actions.shape[1] % ACTION_DIM:
             raise InvalidValueError(f"actions must be (T, {ACTION_DIM}) with T >= 1, got {actions.shape}")
         if times.shape != actions.shape[:1]:
             raise InvalidValueError(f"times must be ({len(actions)},) like the actions, got {times.shape}")
         if not np.isfinite(actions).all():
             raise InvalidValueError(f"actions {actions.shape} hold values that are not finite")
-        if not (
-            np.isfinite(times).all() and times.min() >= 0 and times.max() <= 1 and (np.diff(times) > 0).all()
-        ):
+        if not (np.isfinite(times).all() and times.min() >= 0 and times.max() <= 1 and (np.diff(times) > 0).all()):
             raise InvalidValueError(f"times {times.shape} must increase strictly within [0, 1]")
         actions.flags.writeable = False
         times.flags.writeable = False
