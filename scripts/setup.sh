@@ -1,0 +1,122 @@
+#!/usr/bin/env bash
+# Makes .venv/ with everything that `make demo` and `make test` need, system packages included.
+# Safe to run again: when nothing changed it ends at once.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+readonly TORCH=$(grep '^torch==' constraints.txt)
+readonly TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
+readonly EXTRAS=sim,vision,embedded,train,dev
+readonly STAMP=.venv/setup-stamp
+
+say() { printf '\033[1m[setup]\033[0m %s\n' "$*"; }
+die() { printf '[setup] %s\n' "$*" >&2; exit 1; }
+
+as_root() {
+  if [ "$(id -u)" = 0 ]; then "$@"; elif command -v sudo >/dev/null; then sudo "$@"; else return 1; fi
+}
+
+apt_ready=
+apt_install() {
+  command -v apt-get >/dev/null || return 1
+  if [ -z "$apt_ready" ]; then
+    say "reading the package lists"
+    as_root apt-get update -qq || return 1
+    apt_ready=1
+  fi
+  say "installing system packages: $*"
+  as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null
+}
+
+find_python() {
+  local candidate
+  for candidate in python3.11 python3.12 python3.13 python3; do
+    if command -v "$candidate" >/dev/null &&
+      "$candidate" -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
+      echo "$candidate"
+      return
+    fi
+  done
+  return 1
+}
+
+fingerprint() { cat pyproject.toml constraints.txt scripts/setup.sh | sha256sum | cut -d' ' -f1; }
+
+# Prints nothing and succeeds if the simulator can render an image on this machine.
+renderer_works() { .venv/bin/python -m robust_instant_policy.tasks.maniskill.renderer >/dev/null 2>&1; }
+
+add_debian_backports() {
+  # Debian 12's own Mesa (22.3) lacks the descriptor indexing that SAPIEN needs; its backports have 25.
+  local list=/etc/apt/sources.list.d/robust-instant-policy-backports.sources
+  [ -e "$list" ] && return
+  local mirror
+  mirror=$(grep -rhoE 'https?://[^ ]+/debian/?( |$)' /etc/apt/sources.list /etc/apt/sources.list.d 2>/dev/null |
+    grep -v -e snapshot -e security | head -n 1 | tr -d ' ')
+  printf 'Types: deb\nURIs: %s\nSuites: bookworm-backports\nComponents: main\nSigned-By: %s\n' \
+    "${mirror:-http://deb.debian.org/debian}" /usr/share/keyrings/debian-archive-keyring.gpg |
+    as_root tee "$list" >/dev/null
+  apt_ready=
+}
+
+install_vulkan() {
+  say "no Vulkan driver that the simulator accepts; installing Mesa's CPU driver"
+  local id= codename=
+  [ -r /etc/os-release ] && id=$(. /etc/os-release && echo "$ID") && codename=$(. /etc/os-release && echo "${VERSION_CODENAME:-}")
+  if [ "$id/$codename" = debian/bookworm ]; then
+    add_debian_backports && apt_install libvulkan1 &&
+      as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
+        -t bookworm-backports mesa-vulkan-drivers >/dev/null
+  else
+    apt_install libvulkan1 mesa-vulkan-drivers
+  fi
+}
+
+if [ -f "$STAMP" ] && [ "$(cat "$STAMP")" = "$(fingerprint)" ]; then
+  exit 0
+fi
+
+case "$(uname -s)/$(uname -m)" in
+  Linux/x86_64) ;;
+  *) die "this set-up covers Linux on x86-64; elsewhere: pip install -e '.[$EXTRAS]' and a Vulkan driver" ;;
+esac
+
+python=$(find_python) || {
+  apt_install python3 python3-venv || true
+  python=$(find_python) || { apt_install python3.11 python3.11-venv || true; python=$(find_python); } ||
+    die "needs Python 3.11 to 3.13 with venv; install it (Debian, Ubuntu: apt install python3.11 python3.11-venv) and run again"
+}
+say "using $($python --version)"
+
+# Libraries that wheels link to but do not carry: OpenCV's OpenGL, the simulator's Vulkan loader and X11.
+missing=()
+for library in libGL.so.1:libgl1 libX11.so.6:libx11-6 libvulkan.so.1:libvulkan1 libgomp.so.1:libgomp1 libglib-2.0.so.0:libglib2.0-0; do
+  ldconfig -p 2>/dev/null | grep -q "${library%%:*}" || /sbin/ldconfig -p | grep -q "${library%%:*}" || missing+=("${library##*:}")
+done
+[ -e /etc/ssl/certs/ca-certificates.crt ] || missing+=(ca-certificates)
+command -v git >/dev/null || missing+=(git) # imported by ManiSkill through GitPython
+if [ ${#missing[@]} -gt 0 ]; then
+  apt_install "${missing[@]}" || die "needs the system packages ${missing[*]}; install them and run again"
+fi
+
+[ -x .venv/bin/python ] || "$python" -m venv .venv
+pip=(.venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt)
+
+if ! .venv/bin/python -c 'import torch' 2>/dev/null; then
+  say "installing PyTorch (CPU)"
+  # The plain index serves a build with several GB of CUDA; prefer the CPU build where it can be had.
+  if .venv/bin/python -c "import urllib.request as u; u.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
+    "${pip[@]}" "$TORCH" --index-url "$TORCH_CPU_INDEX" --extra-index-url https://pypi.org/simple || "${pip[@]}" "$TORCH"
+  else
+    "${pip[@]}" "$TORCH"
+  fi
+fi
+say "installing the package and its dependencies"
+"${pip[@]}" -e ".[$EXTRAS]"
+
+if ! renderer_works; then
+  install_vulkan || die "needs a Vulkan driver; install mesa-vulkan-drivers (Mesa 23.1 or newer) and run again"
+  renderer_works || die "the simulator still finds no renderer; see: .venv/bin/rip doctor"
+fi
+
+fingerprint >"$STAMP"
+say "done; the command is .venv/bin/rip"
