@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robust_instant_policy.errors import InvalidValueError
+from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import Trajectory
 
@@ -51,6 +53,31 @@ class Observation:
             ("camera_pose", camera_pose),
         ):
             object.__setattr__(self, name, value)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Observation:
+        """Read an ``.npz`` file that holds arrays named like the fields; raises `DatasetError` in one line."""
+        names = ("rgb", "depth", "intrinsics", "camera_pose")
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                missing = [name for name in names if name not in arrays]
+                if missing:
+                    raise DatasetError(
+                        f"{path} lacks {', '.join(missing)}; an observation is an .npz with {', '.join(names)}"
+                    )
+                return cls(*(arrays[name] for name in names))
+        except FileNotFoundError:
+            raise DatasetError(f"no observation at {path}") from None
+        except InvalidValueError as error:
+            raise DatasetError(f"{path}: {error}") from None
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+            raise DatasetError(f"{path} is not an .npz file with {', '.join(names)}") from None
+
+    def save(self, path: str | Path) -> None:
+        """Write the observation as an ``.npz`` file that `load` reads."""
+        np.savez_compressed(
+            path, rgb=self.rgb, depth=self.depth, intrinsics=self.intrinsics, camera_pose=self.camera_pose
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,21 @@
+"""Policies: methods that know no task."""
+
+from robust_instant_policy.policies.catalogue import METHOD_NAMES, make_policy
+from robust_instant_policy.policies.instant import InstantPolicy, Proposal
+from robust_instant_policy.policies.kat import KeypointActionTokens
+from robust_instant_policy.policies.policy import Plan, Policy, Progress, Stage, Usage
+from robust_instant_policy.policies.rip import RobustInstantPolicy
+
+__all__ = [
+    "METHOD_NAMES",
+    "InstantPolicy",
+    "KeypointActionTokens",
+    "Plan",
+    "Policy",
+    "Progress",
+    "Proposal",
+    "RobustInstantPolicy",
+    "Stage",
+    "Usage",
+    "make_policy",
+]

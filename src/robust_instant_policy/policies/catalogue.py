@@ -1,0 +1,26 @@
+"""The methods by name, as the command line and the tables call them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from robust_instant_policy.errors import UnknownNameError
+from robust_instant_policy.policies.instant import InstantPolicy
+from robust_instant_policy.policies.kat import KeypointActionTokens
+from robust_instant_policy.policies.policy import Policy
+from robust_instant_policy.policies.rip import RobustInstantPolicy
+
+_METHODS: dict[str, Callable[[InstantPolicy, int], Policy]] = {
+    "rip": lambda instant, queries: RobustInstantPolicy(instant, num_queries=queries),
+    "rip-gauss": lambda instant, queries: RobustInstantPolicy(instant, num_queries=queries, dof=math.inf),
+    "kat": lambda instant, queries: KeypointActionTokens(instant, num_queries=queries),
+}
+METHOD_NAMES = tuple(_METHODS)
+
+
+def make_policy(name: str, instant: InstantPolicy, num_queries: int = 5) -> Policy:
+    """The method ``name`` over ``instant``, which several methods may share; raises `UnknownNameError`."""
+    if name not in _METHODS:
+        raise UnknownNameError("method", name, METHOD_NAMES)
+    return _METHODS[name](instant, num_queries)

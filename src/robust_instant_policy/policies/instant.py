@@ -1,0 +1,142 @@
+"""The instant policy Φ: demonstrations and a new image in, sampled trajectories out.
+
+Φ([V, A], V') → ξ̂ (Oh et al. 2025, Sec. III-A; Di Palo and Johns 2024). Keypoints, prompt and language model
+meet here; what is done with the samples is up to the policies that own one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robust_instant_policy.context import InContextPrompt
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import DatasetError, PlanningError, UsageError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.llm import LanguageModel
+from robust_instant_policy.perception import KeypointExtractor, LocatedKeypoints
+from robust_instant_policy.policies.policy import Progress, Stage, Stopwatch, Usage, no_progress
+from robust_instant_policy.query import Answer
+from robust_instant_policy.trajectory import TARGET_STEPS, Trajectory, downsample
+
+MIN_VALID_ANSWERS = 3  # below this nobody can say which one is hallucinated
+QUOTED_ANSWER_CHARS = 160
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """What the instant policy saw and proposed for one observation."""
+
+    located: LocatedKeypoints
+    candidates: tuple[Trajectory, ...]
+    usage: Usage
+    notes: tuple[str, ...]
+
+
+class InstantPolicy:
+    """Samples trajectories for a new scene from a language model that is shown the demonstrations as text.
+
+    ``frames`` ("adaptive" or "world") and ``layout`` ("factorised" or "sequence") choose how numbers are
+    written; ``features`` names the image descriptors; ``downsampling`` is "masked" or "uniform", to
+    ``num_steps`` steps; ``deadline_s`` bounds all the sampling for one plan, in wall seconds.
+    """
+
+    def __init__(
+        self,
+        llm: LanguageModel,
+        *,
+        num_keypoints: int = 10,
+        features: str = "auto",
+        frames: str = "adaptive",
+        layout: str = "factorised",
+        downsampling: str = "masked",
+        num_steps: int = TARGET_STEPS,
+        temperature: float = 0.7,
+        deadline_s: float = 120.0,
+        workspace: FloatArray | None = None,
+        seed: int = 0,
+        progress: Progress = no_progress,
+    ):
+        self.llm = llm
+        self.downsampling, self.num_steps = downsampling, num_steps
+        self.temperature, self.deadline_s, self.seed = temperature, deadline_s, seed
+        self.progress = progress
+        self.extractor = KeypointExtractor(
+            num_keypoints=num_keypoints, features=features, workspace=workspace, seed=seed
+        )
+        self.prompt = InContextPrompt(frames=frames, layout=layout)
+        self._latest: tuple[Observation, int, Proposal] | None = None
+
+    def fit(self, demonstrations: Sequence[Demonstration]) -> InstantPolicy:
+        """Find the common keypoints of ``demonstrations`` and write them down as context; returns itself."""
+        if not demonstrations:
+            raise DatasetError("no demonstrations; show the task at least once (rip record)")
+        self._latest = None
+        self.progress("keypoints", 0, 0)
+        self.extractor.fit([demonstration.observation for demonstration in demonstrations])
+        self.context_ = tuple(
+            downsample(demonstration.trajectory, self.downsampling, self.num_steps) for demonstration in demonstrations
+        )
+        self.prompt.fit(self.extractor.keypoints_, list(self.context_))
+        return self
+
+    def propose(self, observation: Observation, num_queries: int) -> Proposal:
+        """Ask the model ``num_queries`` times what to do in the scene of ``observation``.
+
+        Asking again about the same observation object reuses the answers it already has.
+        Raises `KeypointError` where the scene cannot be recognised and `PlanningError` where fewer than
+        three answers (or ``num_queries``, if fewer were wanted) are usable.
+        """
+        if not hasattr(self, "context_"):
+            raise UsageError("call fit(demonstrations) before asking for a plan")
+        if num_queries < 1:
+            raise UsageError(f"the number of queries must be at least 1, got {num_queries}")
+        if self._latest is not None and self._latest[:2] == (observation, num_queries):
+            return self._latest[2]
+        watch = Stopwatch()
+        self.progress("keypoints", 0, 0)
+        with watch.stage("keypoints"):
+            located = self.extractor.locate(observation)
+        queries = self.prompt.queries(located.keypoints)
+        with watch.stage("language model"):
+            answers = self.llm.sample(
+                queries,
+                num_queries,
+                temperature=self.temperature,
+                seed=self.seed,
+                deadline_s=self.deadline_s,
+                accept=self.prompt.accepts,
+                on_progress=lambda done, total: self.progress("language model", done, total),
+            )
+        watch.stages[-1] = _with_tokens(watch.stages[-1], answers)
+        count = min(len(of_query) for of_query in answers)
+        if count < min(MIN_VALID_ANSWERS, num_queries):
+            raise PlanningError(_too_few(count, num_queries, answers))
+        candidates = tuple(
+            self.prompt.trajectory([of_query[index].text for of_query in answers], located.keypoints)
+            for index in range(count)
+        )
+        notes = (*self.extractor.notes_, *located.notes)
+        if count < num_queries:
+            notes = (*notes, f"{count} of {num_queries} answers were usable in time")
+        proposal = Proposal(located, candidates, Usage(tuple(watch.stages)), notes)
+        self._latest = (observation, num_queries, proposal)
+        return proposal
+
+
+def _with_tokens(stage: Stage, answers: Sequence[Sequence[Answer]]) -> Stage:
+    flat = [answer for of_query in answers for answer in of_query]
+    return replace(
+        stage,
+        prompt_tokens=int(np.sum([answer.prompt_tokens for answer in flat], dtype=int)),
+        cached_tokens=int(np.sum([answer.cached_tokens for answer in flat], dtype=int)),
+        completion_tokens=int(np.sum([answer.completion_tokens for answer in flat], dtype=int)),
+    )
+
+
+def _too_few(count: int, wanted: int, answers: Sequence[Sequence[Answer]]) -> str:
+    said = next((answer.text for of_query in answers for answer in of_query), None)
+    heard = f"it said {said[:QUOTED_ANSWER_CHARS]!r}" if said else "it said nothing usable before the deadline"
+    return f"the model gave {count} usable answers of {wanted}, {min(MIN_VALID_ANSWERS, wanted)} are needed; {heard}"

@@ -1,0 +1,170 @@
+"""What a policy is and what it hands over: the protocol, and the `Plan`."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.trajectory import Trajectory
+
+PLAN_FORMAT = 1  # raised when the layout of plan.json changes
+
+# Called as work goes on: the stage's name, how much of it is done, and how much there is (0 when unknown).
+Progress = Callable[[str, int, int], None]
+
+
+def no_progress(stage: str, done: int, total: int) -> None:
+    """The `Progress` of a caller who does not look."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage of planning cost: wall seconds, and tokens where a language model was asked.
+
+    ``prompt_tokens`` counts what the model was given, ``cached_tokens`` the part of it that it had read before,
+    ``completion_tokens`` what it wrote.
+    """
+
+    name: str
+    seconds: float
+    prompt_tokens: int = 0
+    cached_tokens: int = 0
+    completion_tokens: int = 0
+
+
+@dataclass(frozen=True)
+class Usage:
+    """The stages of one plan, in order."""
+
+    stages: tuple[Stage, ...] = ()
+
+    @property
+    def seconds(self) -> float:
+        return sum(stage.seconds for stage in self.stages)
+
+    @property
+    def tokens(self) -> int:
+        """Tokens the model was given and wrote, cached or not."""
+        return sum(stage.prompt_tokens + stage.completion_tokens for stage in self.stages)
+
+
+class Stopwatch:
+    """Collects the `Stage`s of a plan as they end."""
+
+    def __init__(self) -> None:
+        self.stages: list[Stage] = []
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.stages.append(Stage(name, time.perf_counter() - start))
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A trajectory to execute, and why to trust it.
+
+    ``trajectory`` has T steps; ``candidates`` are the Q trajectories it was made from; ``weights (Q, T)`` in
+    [0, 1] says how much each counted at each step (low = ignored); ``scale (T, 10·A)`` is the spread of the
+    agreement in metres; ``hallucinated (Q,)`` bool names the candidates that left it, ``onset (Q,)`` the first
+    step at which each did (-1: never) and ``scores (Q,)`` how far; ``confidence`` in [0, 1] is the number to
+    gate on, None from a method that has none. ``keypoints (K, 3)``, ``pixels (K, 2)`` and
+    ``keypoint_confidence (K,)`` are what was seen; ``notes`` are remarks for the user, one line each.
+    """
+
+    trajectory: Trajectory
+    candidates: tuple[Trajectory, ...]
+    weights: FloatArray
+    scale: FloatArray
+    hallucinated: NDArray[np.bool_]
+    onset: NDArray[np.int64]
+    scores: FloatArray
+    confidence: float | None
+    keypoints: FloatArray
+    pixels: FloatArray
+    keypoint_confidence: FloatArray
+    usage: Usage = field(default_factory=Usage)
+    notes: tuple[str, ...] = ()
+
+    def save(self, path: str | Path) -> None:
+        """Write the plan as JSON."""
+        content = {
+            "format": PLAN_FORMAT,
+            "trajectory": _to_json(self.trajectory),
+            "candidates": [_to_json(candidate) for candidate in self.candidates],
+            **{name: getattr(self, name).tolist() for name in _ARRAYS},
+            "confidence": self.confidence,
+            "usage": [vars(stage) for stage in self.usage.stages],
+            "notes": list(self.notes),
+        }
+        Path(path).write_text(json.dumps(content, allow_nan=False) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Plan:
+        """Read a plan written by `save`; raises `DatasetError` in one line."""
+        try:
+            content = json.loads(Path(path).read_text())
+            if content["format"] != PLAN_FORMAT:
+                raise DatasetError(f"{path} has plan format {content['format']}, this version reads {PLAN_FORMAT}")
+            return cls(
+                trajectory=_from_json(content["trajectory"]),
+                candidates=tuple(_from_json(candidate) for candidate in content["candidates"]),
+                confidence=content["confidence"],
+                usage=Usage(tuple(Stage(**stage) for stage in content["usage"])),
+                notes=tuple(content["notes"]),
+                **{name: np.array(content[name], dtype=dtype) for name, dtype in _ARRAYS.items()},
+            )
+        except FileNotFoundError:
+            raise DatasetError(f"no plan at {path}") from None
+        except (KeyError, TypeError, ValueError, InvalidValueError) as error:
+            raise DatasetError(f"{path} is not a plan: {error}") from None
+
+
+_ARRAYS: dict[str, type] = {
+    "weights": np.float64,
+    "scale": np.float64,
+    "hallucinated": np.bool_,
+    "onset": np.int64,
+    "scores": np.float64,
+    "keypoints": np.float64,
+    "pixels": np.float64,
+    "keypoint_confidence": np.float64,
+}
+
+
+def _to_json(trajectory: Trajectory) -> dict[str, list]:
+    return {"times": trajectory.times.tolist(), "actions": trajectory.actions.tolist()}
+
+
+def _from_json(content: dict[str, list]) -> Trajectory:
+    return Trajectory(np.array(content["actions"]), np.array(content["times"]))
+
+
+class Policy(Protocol):
+    """Sees demonstrations once, then plans for new observations."""
+
+    name: str
+
+    def fit(self, demonstrations: Sequence[Demonstration]) -> Policy:
+        """Take in the demonstrations; returns itself."""
+        ...
+
+    def plan(self, observation: Observation) -> Plan:
+        """Plan for a new scene; raises `KeypointError` or `PlanningError` where no plan can be trusted."""
+        ...
+
+    def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
+        """The trajectories that an evaluation executes for ``plan``, one after the other."""
+        ...
