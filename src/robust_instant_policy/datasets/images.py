@@ -1,0 +1,64 @@
+"""The start-of-episode image and depth as PNG files: any viewer opens them, and they lose nothing."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from robust_instant_policy.errors import DatasetError
+
+FINE_UNIT_M = 1e-4  # one step of 16-bit depth; reaches 6.5 m
+COARSE_UNIT_M = 1e-3  # for cameras that read further; reaches 65.5 m
+MAX_STEPS = np.iinfo(np.uint16).max
+
+
+def encode_png(image: NDArray) -> bytes:
+    """PNG of an RGB image ``(H, W, 3)`` uint8 or a grey one ``(H, W)`` uint16."""
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(image)).save(buffer, format="png")
+    return buffer.getvalue()
+
+
+def encode_depth(depth: NDArray[np.float32]) -> tuple[bytes, float]:
+    """16-bit PNG of ``depth (H, W)`` metres, and the metres that one of its steps stands for.
+
+    No reading (NaN, infinity, zero or less) becomes 0. Raises `DatasetError` for depth that 16 bits cannot
+    hold to the millimetre.
+    """
+    metres = np.asarray(depth, dtype=np.float64)
+    valid = np.isfinite(metres) & (metres > 0)
+    furthest = float(metres[valid].max(initial=0.0))
+    unit = FINE_UNIT_M if furthest <= MAX_STEPS * FINE_UNIT_M else COARSE_UNIT_M
+    if furthest > MAX_STEPS * unit:
+        raise DatasetError(
+            f"depth reads up to {furthest:.1f} m, but at most {MAX_STEPS * unit:.1f} m can be kept to the millimetre; "
+            "set pixels beyond the workspace to NaN"
+        )
+    steps = np.zeros(metres.shape, dtype=np.uint16)
+    steps[valid] = np.clip(np.rint(metres[valid] / unit), 1, MAX_STEPS).astype(np.uint16)
+    return encode_png(steps), unit
+
+
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """RGB image ``(H, W, 3)`` uint8."""
+    return np.asarray(_open(path).convert("RGB"))
+
+
+def read_depth(path: Path, unit: float) -> NDArray[np.float32]:
+    """Depth ``(H, W)`` float32 metres, NaN where there is no reading."""
+    steps = np.asarray(_open(path)).astype(np.float64)
+    steps[steps == 0] = np.nan
+    return (steps * unit).astype(np.float32)
+
+
+def _open(path: Path) -> Image.Image:
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise DatasetError(f"{path} cannot be read as an image: restore it, or record the folder again") from error

@@ -1,0 +1,60 @@
+"""Where things lie in a demonstrations folder: a LeRobotDataset v3.0 with a few additions of our own.
+
+The format is that of `lerobot` 0.4.4 (``src/lerobot/datasets/lerobot_dataset.py`` and ``utils.py``). It lets a
+file hold one or many episodes; here every episode has files of its own, numbered like the episode, so that
+recording only ever adds files. See ``docs/datasets.md``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from robust_instant_policy.trajectory import ACTION_DIM
+
+CODEBASE_VERSION = "v3.0"
+RIP_FORMAT = 1  # version of what we add: rip.json, the start/ folder and the rip/ columns
+
+INFO_PATH = Path("meta/info.json")
+STATS_PATH = Path("meta/stats.json")
+TASKS_PATH = Path("meta/tasks.parquet")
+RIP_PATH = Path("meta/rip.json")
+
+FILES_PER_CHUNK = 1000
+CHUNK_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA_PATTERN = f"data/{CHUNK_FILE}.parquet"
+EPISODES_PATTERN = f"meta/episodes/{CHUNK_FILE}.parquet"
+VIDEO_PATTERN = f"videos/{{video_key}}/{CHUNK_FILE}.mp4"
+START_RGB_PATTERN = f"start/rgb/{CHUNK_FILE}.png"
+START_DEPTH_PATTERN = f"start/depth/{CHUNK_FILE}.png"
+EPISODE_FOLDERS = ("data", "meta/episodes", "videos", "start")
+
+VIDEO_KEY = "observation.images.top"
+ACTION_KEY = "action"
+STATE_KEY = "observation.state"
+
+INTRINSICS_COLUMN = "rip/intrinsics"
+CAMERA_POSE_COLUMN = "rip/camera_pose"
+DEPTH_UNIT_COLUMN = "rip/depth_unit_m"
+SEED_COLUMN = "rip/seed"
+INFO_COLUMN = "rip/info"
+
+
+def chunk_and_file(episode: int) -> tuple[int, int]:
+    """Chunk and file index of an episode's own files."""
+    return divmod(episode, FILES_PER_CHUNK)
+
+
+def episode_path(pattern: str, episode: int) -> Path:
+    """Path, within the folder, of an episode's own file."""
+    chunk, file = chunk_and_file(episode)
+    return Path(pattern.format(chunk_index=chunk, file_index=file, video_key=VIDEO_KEY))
+
+
+def axis_names(num_arms: int) -> list[str]:
+    """Names of the ``10·A`` action dimensions, in order."""
+    points = [f"{point}.{axis}" for point in ("palm", "finger_1", "finger_2") for axis in "xyz"]
+    names = [*points, "gripper"]
+    assert len(names) == ACTION_DIM
+    if num_arms == 1:
+        return names
+    return [f"arm_{arm}.{name}" for arm in range(num_arms) for name in names]

@@ -1,0 +1,353 @@
+"""Recording demonstrations, so that being killed at any moment loses at most the episode under way."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from robust_instant_policy.datasets import layout
+from robust_instant_policy.datasets.files import PART_SUFFIX, lock_folder, make_folder, write_error, write_whole
+from robust_instant_policy.datasets.folder import Folder, open_folder, read_json
+from robust_instant_policy.datasets.images import encode_depth, encode_png
+from robust_instant_policy.datasets.statistics import Statistics, combine, feature_statistics, image_statistics
+from robust_instant_policy.datasets.video import CODEC, PIXEL_FORMAT, encode_video
+from robust_instant_policy.demonstration import Demonstration
+from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.trajectory import ACTION_DIM
+
+EVEN_TIMING_TOLERANCE = 1e-6  # of an episode's duration
+EPISODE_FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.(?:parquet|png|mp4)$")
+
+
+class DatasetWriter:
+    """Adds demonstrations to a folder; makes it, or goes on where an earlier writer stopped.
+
+    All episodes share one ``task``, its ``description`` in words, and the recording rate. An episode is finished
+    once ``meta/info.json`` counts it: its files are written first, that one last, each of them whole or not at all.
+    So a killed process leaves at most files that nobody counts, and the next writer removes them.
+
+    Raises `DatasetError` for a folder of another task or rate, one that holds something else, one that another
+    process is writing to, and when the disk is full.
+    """
+
+    def __init__(self, path: str | Path, task: str, description: str, rate_hz: float):
+        self.path = Path(path)
+        self.task, self.description, self.rate_hz = task, description, float(rate_hz)
+        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise DatasetError(f"the recording rate must be positive, got {rate_hz} Hz")
+        try:
+            make_folder(self.path)
+        except OSError as error:
+            raise write_error(self.path, error) from error
+        self._lock: int | None = lock_folder(self.path)
+        try:
+            self._resume()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> DatasetWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let other processes write to the folder. Everything added is on the disk already."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    @property
+    def num_episodes(self) -> int:
+        """Episodes finished, those of earlier writers included."""
+        return 0 if self._folder is None else len(self._folder.episodes)
+
+    @property
+    def discarded(self) -> int:
+        """Attempts thrown away, those of earlier writers included."""
+        return len(self._discarded_seeds)
+
+    @property
+    def last_seed(self) -> int | None:
+        """The largest seed tried so far, kept or thrown away; the next one to try is one more."""
+        kept = [] if self._folder is None else [row[layout.SEED_COLUMN] for row in self._folder.episodes]
+        return max((seed for seed in [*kept, *self._discarded_seeds] if seed is not None), default=None)
+
+    def discard(self, seed: int | None = None) -> None:
+        """Remember that an attempt, of ``seed`` if it had one, was thrown away."""
+        self._write_own([*self._discarded_seeds, seed])
+
+    def add(self, demonstration: Demonstration, images: NDArray[np.uint8] | None = None) -> None:
+        """Append an episode, with ``images (T, H, W, 3)`` uint8 along the way for all episodes or for none.
+
+        When this returns, the episode is on the disk; when it raises, the folder is as it was before.
+        """
+        if self._lock is None:
+            raise DatasetError(f"the writer of {self.path} is closed; open a new one to add episodes")
+        self._check(demonstration, images)
+        try:
+            self._write_episode(demonstration, images)
+        except BaseException:
+            self._remove_unfinished()
+            raise
+        finally:
+            self._folder = self._finished()
+
+    def _resume(self) -> None:
+        """Take up what earlier writers finished, and remove what they did not."""
+        if (self.path / layout.RIP_PATH).exists():
+            own = read_json(self.path / layout.RIP_PATH)
+            if own.get("task") != self.task:
+                raise DatasetError(f"{self.path} holds demonstrations of {own.get('task')!r}, not of {self.task!r}")
+            if own.get("rate_hz") != self.rate_hz:
+                raise DatasetError(f"{self.path} was recorded at {own.get('rate_hz')} Hz, not at {self.rate_hz} Hz")
+            self.description = str(own.get("description", self.description))
+            self._discarded_seeds: list[int | None] = list(own.get("discarded_seeds", []))
+            self._folder = self._finished()
+            self._remove_unfinished()
+            return
+        strangers = [file for file in self.path.rglob("*") if file.is_file() and not file.name.endswith(PART_SUFFIX)]
+        if strangers:
+            raise DatasetError(f"{self.path} holds other files ({strangers[0].name}); choose an empty or a new folder")
+        self._folder = None
+        self._write_own([])
+
+    def _finished(self) -> Folder | None:
+        return open_folder(self.path, self.task) if (self.path / layout.INFO_PATH).exists() else None
+
+    def _remove_unfinished(self) -> None:
+        finished = self._finished()
+        count = 0 if finished is None else len(finished.episodes)
+        for top in (*layout.EPISODE_FOLDERS, "meta"):
+            for file in (self.path / top).rglob("*"):
+                match = EPISODE_FILE.search(file.as_posix())
+                beyond = match and int(match[1]) * layout.FILES_PER_CHUNK + int(match[2]) >= count
+                if beyond or file.name.endswith(PART_SUFFIX):
+                    file.unlink(missing_ok=True)
+
+    def _write_own(self, discarded_seeds: list[int | None]) -> None:
+        own = {
+            "format": layout.RIP_FORMAT,
+            "task": self.task,
+            "description": self.description,
+            "rate_hz": self.rate_hz,
+            "discarded_seeds": discarded_seeds,
+        }
+        write_whole(self.path / layout.RIP_PATH, _json(own))
+        self._discarded_seeds = discarded_seeds
+
+    def _check(self, demonstration: Demonstration, images: NDArray[np.uint8] | None) -> None:
+        """Refuse, before anything is written, what the folder cannot hold."""
+        trajectory = demonstration.trajectory
+        if demonstration.task not in ("", self.task):
+            raise DatasetError(f"a demonstration of {demonstration.task!r} cannot go into {self.path} of {self.task!r}")
+        if demonstration.rate_hz != self.rate_hz:
+            raise DatasetError(f"{self.path} is recorded at {self.rate_hz} Hz, the episode at {demonstration.rate_hz}")
+        if np.abs(trajectory.times - np.linspace(0, 1, len(trajectory))).max() > EVEN_TIMING_TOLERANCE:
+            raise DatasetError("a recorded trajectory must be evenly timed; resample it with Trajectory.resampled")
+        if images is not None and (images.shape[0] != len(trajectory) or images.ndim != 4 or images.dtype != np.uint8):
+            raise DatasetError(
+                f"images must be ({len(trajectory)}, H, W, 3) uint8 like the trajectory, got {images.shape} {images.dtype}"
+            )
+        if self._folder is None:
+            return
+        features = self._folder.info["features"]
+        declared = _features(trajectory.num_arms, images, self.rate_hz)
+        for key in sorted({*features, *declared}):
+            old, new = (entry.get(key, {}).get("shape") for entry in (features, declared))
+            if old != new:
+                raise DatasetError(
+                    f"every episode of {self.path} must be alike: {key} is {old or 'absent'} in the folder, "
+                    f"{new or 'absent'} in the new episode"
+                )
+
+    def _write_episode(self, demonstration: Demonstration, images: NDArray[np.uint8] | None) -> None:
+        episode = self.num_episodes
+        first_frame = 0 if self._folder is None else int(self._folder.info["total_frames"])
+        length = len(demonstration.trajectory)
+        columns = self._frame_columns(demonstration, episode, first_frame)
+        statistics = {key: feature_statistics(value.reshape(length, -1)) for key, value in columns.items()}
+        chunk, file = layout.chunk_and_file(episode)
+        row: dict[str, Any] = {
+            "episode_index": episode,
+            "tasks": [self.description],
+            "length": length,
+            "data/chunk_index": chunk,
+            "data/file_index": file,
+            "dataset_from_index": first_frame,
+            "dataset_to_index": first_frame + length,
+            "meta/episodes/chunk_index": chunk,
+            "meta/episodes/file_index": file,
+        }
+        if images is not None:
+            self._write_file(layout.VIDEO_PATTERN, episode, encode_video(images, self.rate_hz))
+            row |= {
+                f"videos/{layout.VIDEO_KEY}/chunk_index": chunk,
+                f"videos/{layout.VIDEO_KEY}/file_index": file,
+                f"videos/{layout.VIDEO_KEY}/from_timestamp": 0.0,
+                f"videos/{layout.VIDEO_KEY}/to_timestamp": length / self.rate_hz,
+            }
+            statistics[layout.VIDEO_KEY] = image_statistics(images)
+        row |= self._write_start(demonstration, episode)
+        self._write_file(layout.DATA_PATTERN, episode, _parquet(_frame_table(columns)))
+        self._write_file(layout.EPISODES_PATTERN, episode, _parquet(_episode_table(row, statistics)))
+        self._write_dataset(demonstration, images, statistics, first_frame + length)
+
+    def _frame_columns(self, demonstration: Demonstration, episode: int, first_frame: int) -> dict[str, NDArray]:
+        steps = np.arange(len(demonstration.trajectory))
+        actions = demonstration.trajectory.actions.astype(np.float32)
+        return {
+            layout.ACTION_KEY: actions,
+            layout.STATE_KEY: actions,
+            "timestamp": (steps / self.rate_hz).astype(np.float32),
+            "frame_index": steps,
+            "episode_index": np.full_like(steps, episode),
+            "index": first_frame + steps,
+            "task_index": np.zeros_like(steps),
+        }
+
+    def _write_start(self, demonstration: Demonstration, episode: int) -> dict[str, Any]:
+        """Write the start-of-episode images; the columns say the rest of what was known at the start."""
+        observation = demonstration.observation
+        depth, unit = encode_depth(observation.depth)
+        self._write_file(layout.START_RGB_PATTERN, episode, encode_png(observation.rgb))
+        self._write_file(layout.START_DEPTH_PATTERN, episode, depth)
+        return {
+            layout.INTRINSICS_COLUMN: observation.intrinsics.ravel().tolist(),
+            layout.CAMERA_POSE_COLUMN: observation.camera_pose.ravel().tolist(),
+            layout.DEPTH_UNIT_COLUMN: unit,
+            layout.SEED_COLUMN: demonstration.seed,
+            layout.INFO_COLUMN: json.dumps(dict(demonstration.info), sort_keys=True),
+        }
+
+    def _write_dataset(
+        self,
+        demonstration: Demonstration,
+        images: NDArray[np.uint8] | None,
+        statistics: dict[str, Statistics],
+        total_frames: int,
+    ) -> None:
+        """Write the files that speak of the whole folder; the last one finishes the episode."""
+        if self._folder is None:
+            write_whole(self.path / layout.TASKS_PATH, _parquet(_task_table(self.description)))
+            features = _features(demonstration.trajectory.num_arms, images, self.rate_hz)
+        else:
+            features = self._folder.info["features"]
+        rows = [] if self._folder is None else self._folder.episodes
+        parts = [_row_statistics(row, list(statistics)) for row in rows] + [statistics]
+        whole = {key: combine([part[key] for part in parts]) for key in statistics}
+        write_whole(self.path / layout.STATS_PATH, _json({key: _listed(value) for key, value in whole.items()}))
+        info = {
+            "codebase_version": layout.CODEBASE_VERSION,
+            "robot_type": None,
+            "total_episodes": len(parts),
+            "total_frames": total_frames,
+            "total_tasks": 1,
+            "chunks_size": layout.FILES_PER_CHUNK,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "fps": int(self.rate_hz) if self.rate_hz.is_integer() else self.rate_hz,
+            "splits": {"train": f"0:{len(parts)}"},
+            "data_path": layout.DATA_PATTERN,
+            "video_path": layout.VIDEO_PATTERN if layout.VIDEO_KEY in features else None,
+            "features": features,
+        }
+        write_whole(self.path / layout.INFO_PATH, _json(info))
+
+    def _write_file(self, pattern: str, episode: int, content: bytes) -> None:
+        write_whole(self.path / layout.episode_path(pattern, episode), content)
+
+
+def _features(num_arms: int, images: NDArray[np.uint8] | None, rate_hz: float) -> dict[str, dict[str, Any]]:
+    """What each frame consists of, in the words of ``meta/info.json``."""
+    gripper = {"dtype": "float32", "shape": [ACTION_DIM * num_arms], "names": layout.axis_names(num_arms)}
+    features: dict[str, dict[str, Any]] = {layout.ACTION_KEY: gripper, layout.STATE_KEY: gripper}
+    if images is not None:
+        height, width = images.shape[1:3]
+        features[layout.VIDEO_KEY] = {
+            "dtype": "video",
+            "shape": [height, width, 3],
+            "names": ["height", "width", "channels"],
+            "info": {
+                "video.height": height,
+                "video.width": width,
+                "video.codec": "h264",
+                "video.pix_fmt": PIXEL_FORMAT,
+                "video.is_depth_map": False,
+                "video.fps": rate_hz,
+                "video.channels": 3,
+                "has_audio": False,
+            },
+        }
+    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+    for key in ("frame_index", "episode_index", "index", "task_index"):
+        features[key] = {"dtype": "int64", "shape": [1], "names": None}
+    return features
+
+
+def _frame_table(columns: dict[str, NDArray]) -> pa.Table:
+    return pa.table(
+        {
+            key: pa.FixedSizeListArray.from_arrays(value.ravel(), value.shape[1]) if value.ndim == 2 else value
+            for key, value in columns.items()
+        }
+    )
+
+
+def _episode_table(row: dict[str, Any], statistics: dict[str, Statistics]) -> pa.Table:
+    """One row; the types are said, since a missing seed has none and all files must agree."""
+    table = {key: pa.array([value]) for key, value in row.items() if key != layout.SEED_COLUMN}
+    table[layout.SEED_COLUMN] = pa.array([row[layout.SEED_COLUMN]], type=pa.int64())
+    for key, entries in statistics.items():
+        for name, value in _listed(entries).items():
+            table[f"stats/{key}/{name}"] = pa.array([value])
+    return pa.table(table)
+
+
+def _row_statistics(row: Any, keys: list[str]) -> dict[str, Statistics]:
+    names = [column.split("/")[-1] for column in row if column.startswith(f"stats/{keys[0]}/")]
+    return {key: {name: np.array(row[f"stats/{key}/{name}"]) for name in names} for key in keys}
+
+
+def _listed(statistics: Statistics) -> dict[str, list]:
+    return {
+        name: value.astype(np.int64).tolist() if name == "count" else value.tolist()
+        for name, value in statistics.items()
+    }
+
+
+def _task_table(description: str) -> pa.Table:
+    """``meta/tasks.parquet``: a pandas table whose index is the task in words, as `lerobot` expects it."""
+    columns = [
+        {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
+        {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"},
+    ]
+    pandas = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [{**column, "metadata": None} for column in columns],
+    }
+    table = pa.table({"task_index": pa.array([0], pa.int64()), "task": pa.array([description])})
+    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+
+
+def _parquet(table: pa.Table) -> bytes:
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    return sink.getvalue().to_pybytes()
+
+
+def _json(content: dict[str, Any]) -> bytes:
+    return json.dumps(content, indent=2, ensure_ascii=False).encode()
