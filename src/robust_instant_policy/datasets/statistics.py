@@ -34,7 +34,7 @@ def feature_statistics(values: ArrayLike) -> dict[str, FloatArray]:
 
 
 def image_statistics(images: NDArray[np.uint8]) -> dict[str, FloatArray]:
-    """Statistics of each channel of ``images (T, H, W, 3)``: each ``(3, 1, 1)`` in [0, 1], and ``count (1,)`` frames."""
+    """Statistics of each channel of ``images (T, H, W, 3)``: ``(3, 1, 1)`` in [0, 1], and ``count (1,)`` of frames."""
     frames = np.unique(np.linspace(0, len(images) - 1, MAX_FRAMES).astype(np.intp))
     stride = -(-max(images.shape[1:3]) // MAX_SIDE_PX)
     pixels = images[frames, ::stride, ::stride].reshape(-1, 3) / 255.0

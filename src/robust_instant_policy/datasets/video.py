@@ -6,11 +6,13 @@ import io
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from types import TracebackType
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 
+from robust_instant_policy.datasets.files import write_whole
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 
 CODEC = "libx264"
@@ -25,30 +27,80 @@ def rate_fraction(rate_hz: float) -> Fraction:
     return Fraction(rate_hz).limit_denominator(MAX_RATE_DENOMINATOR)
 
 
-def encode_video(images: NDArray[np.uint8], rate_hz: float) -> bytes:
-    """MP4 of ``images (T, H, W, 3)`` uint8, H and W even.
+class VideoEncoder:
+    """Makes an MP4 of images ``(H, W, 3)`` uint8, H and W even, one by one.
 
-    One thread and no reordered frames: the same images give the same bytes on every machine, and frame t
-    is shown at exactly t / rate.
+    One thread and no reordered frames: the same images give the same bytes on every machine, and frame t is
+    shown at exactly t / rate.
     """
-    count, height, width, _ = images.shape
-    if count == 0 or height % 2 or width % 2:
-        raise InvalidValueError(f"a video needs at least one image of even height and width, got {images.shape}")
-    rate = rate_fraction(rate_hz)
-    buffer = io.BytesIO()
-    with av.open(buffer, "w", format="mp4") as container:
-        stream = container.add_stream(CODEC, rate=rate)
-        stream.width, stream.height, stream.pix_fmt = width, height, PIXEL_FORMAT
-        stream.codec_context.time_base = 1 / rate
-        stream.codec_context.thread_count = 1
-        stream.options = {"crf": QUALITY_CRF, "g": KEYFRAME_INTERVAL, "bf": "0"}
-        for step, image in enumerate(images):
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-            frame.pts = step
-            frame.time_base = 1 / rate
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return buffer.getvalue()
+
+    def __init__(self, rate_hz: float):
+        self._rate = rate_fraction(rate_hz)
+        self._buffer = io.BytesIO()
+        self._container = av.open(self._buffer, "w", format="mp4")
+        self._stream = self._container.add_stream(CODEC, rate=self._rate)
+        self._stream.pix_fmt = PIXEL_FORMAT
+        self._stream.codec_context.time_base = 1 / self._rate
+        self._stream.codec_context.thread_count = 1
+        self._stream.options = {"crf": QUALITY_CRF, "g": KEYFRAME_INTERVAL, "bf": "0"}
+        self.num_images = 0
+
+    def add(self, image: NDArray[np.uint8]) -> None:
+        """Append an image of the size of the first. Raises `InvalidValueError` for any other."""
+        height, width = image.shape[:2]
+        if self.num_images == 0:
+            self._stream.width, self._stream.height = width, height
+        if image.dtype != np.uint8 or image.shape != (self._stream.height, self._stream.width, 3):
+            raise InvalidValueError(f"a video needs images alike, (H, W, 3) uint8, got {image.shape} {image.dtype}")
+        if height % 2 or width % 2:
+            raise InvalidValueError(f"a video needs images of even height and width, got {width} x {height} pixels")
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        frame.pts = self.num_images
+        frame.time_base = 1 / self._rate
+        self._container.mux(self._stream.encode(frame))
+        self.num_images += 1
+
+    def finish(self) -> bytes:
+        """The whole video; nothing can be added any more."""
+        if self.num_images:
+            self._container.mux(self._stream.encode(None))
+        self._container.close()
+        return self._buffer.getvalue() if self.num_images else b""
+
+
+class VideoWriter:
+    """Writes a video to ``path`` when closed, whole; no file where no image came.
+
+    >>> with VideoWriter("run.mp4", fps=20) as video:
+    ...     task.execute(trajectory, on_frame=video.add)
+    """
+
+    def __init__(self, path: str | Path, fps: float):
+        self._path = Path(path)
+        self._encoder = VideoEncoder(fps)
+        self.add = self._encoder.add
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Write the file. Raises `DatasetError` when that is not possible."""
+        content = self._encoder.finish()
+        if content:
+            write_whole(self._path, content)
+
+
+def encode_video(images: NDArray[np.uint8], rate_hz: float) -> bytes:
+    """MP4 of ``images (T, H, W, 3)`` uint8, T at least 1, H and W even."""
+    encoder = VideoEncoder(rate_hz)
+    for image in images:
+        encoder.add(image)
+    return encoder.finish()
 
 
 def decode_video(path: Path, start_s: float = 0.0, stop_s: float = float("inf")) -> Iterator[NDArray[np.uint8]]:

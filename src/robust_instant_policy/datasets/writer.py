@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -19,7 +20,7 @@ from robust_instant_policy.datasets.files import PART_SUFFIX, lock_folder, make_
 from robust_instant_policy.datasets.folder import Folder, open_folder, read_json
 from robust_instant_policy.datasets.images import encode_depth, encode_png
 from robust_instant_policy.datasets.statistics import Statistics, combine, feature_statistics, image_statistics
-from robust_instant_policy.datasets.video import CODEC, PIXEL_FORMAT, encode_video
+from robust_instant_policy.datasets.video import PIXEL_FORMAT, encode_video
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.trajectory import ACTION_DIM
@@ -157,9 +158,10 @@ class DatasetWriter:
             raise DatasetError(f"{self.path} is recorded at {self.rate_hz} Hz, the episode at {demonstration.rate_hz}")
         if np.abs(trajectory.times - np.linspace(0, 1, len(trajectory))).max() > EVEN_TIMING_TOLERANCE:
             raise DatasetError("a recorded trajectory must be evenly timed; resample it with Trajectory.resampled")
-        if images is not None and (images.shape[0] != len(trajectory) or images.ndim != 4 or images.dtype != np.uint8):
+        if images is not None and (images.ndim != 4 or images.shape[0] != len(trajectory) or images.dtype != np.uint8):
             raise DatasetError(
-                f"images must be ({len(trajectory)}, H, W, 3) uint8 like the trajectory, got {images.shape} {images.dtype}"
+                f"images must be ({len(trajectory)}, H, W, 3) uint8 like the trajectory, "
+                f"got {images.shape} {images.dtype}"
             )
         if self._folder is None:
             return
@@ -236,7 +238,7 @@ class DatasetWriter:
         self,
         demonstration: Demonstration,
         images: NDArray[np.uint8] | None,
-        statistics: dict[str, Statistics],
+        statistics: Mapping[str, Statistics],
         total_frames: int,
     ) -> None:
         """Write the files that speak of the whole folder; the last one finishes the episode."""
@@ -306,7 +308,7 @@ def _frame_table(columns: dict[str, NDArray]) -> pa.Table:
     )
 
 
-def _episode_table(row: dict[str, Any], statistics: dict[str, Statistics]) -> pa.Table:
+def _episode_table(row: dict[str, Any], statistics: Mapping[str, Statistics]) -> pa.Table:
     """One row; the types are said, since a missing seed has none and all files must agree."""
     table = {key: pa.array([value]) for key, value in row.items() if key != layout.SEED_COLUMN}
     table[layout.SEED_COLUMN] = pa.array([row[layout.SEED_COLUMN]], type=pa.int64())
