@@ -18,7 +18,7 @@ __all__ = [
     "obtain_demonstrations",
     "roll_out",
     "run_experiment",
-    "success_table",
     "scene_seed",
+    "success_table",
     "wilson_interval",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,18 +79,21 @@ def run_experiment(
     table = EpisodeTable(out / "episodes.parquet")
     done = 0
     for task_name in experiment.tasks:
-        wanted = [
-            (scene_seed(experiment.seed, index), method)
-            for index, method in itertools.product(range(experiment.num_episodes), experiment.methods)
-        ]
-        open_plans = [
-            (seed, method)
-            for seed, method in wanted
-            if (task_name, method, experiment.num_demonstrations, seed) not in table.scenes
-        ]
-        done += len(wanted) - len(open_plans)
+        scenes = table.scenes
+        missing = {
+            seed: methods
+            for seed in (scene_seed(experiment.seed, index) for index in range(experiment.num_episodes))
+            if (
+                methods := [
+                    method
+                    for method in experiment.methods
+                    if (task_name, method, experiment.num_demonstrations, seed) not in scenes
+                ]
+            )
+        }
+        done += experiment.num_episodes * len(experiment.methods) - sum(map(len, missing.values()))
         on_episodes(done, experiment.num_plans, [])
-        if not open_plans:
+        if not missing:
             continue
         task = make_task(task_name)
         try:
@@ -102,13 +104,15 @@ def run_experiment(
                 lambda there, count, thrown, name=task_name: on_recording(name, there, count, thrown),
             )
             instant = make_instant(task).fit(demonstrations)
-            for seed, method in open_plans:
-                policy = make_policy(method, instant, experiment.num_queries)
-                rows = roll_out(task, policy, seed, experiment.num_demonstrations)
-                table.add(rows)
-                (out / "table.md").write_text(success_table(table.rows))
-                done += 1
-                on_episodes(done, experiment.num_plans, rows)
+            for seed, methods in missing.items():
+                observation = task.reset(seed)
+                for method in methods:
+                    policy = make_policy(method, instant, experiment.num_queries)
+                    rows = roll_out(task, policy, observation, seed, experiment.num_demonstrations)
+                    table.add(rows)
+                    (out / "table.md").write_text(success_table(table.rows))
+                    done += 1
+                    on_episodes(done, experiment.num_plans, rows)
         finally:
             task.close()
     return table

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import time
 
+from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError, PlanningError, UnreachableError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.policies import Policy
 from robust_instant_policy.tasks.task import Task
 
 
-def roll_out(task: Task, policy: Policy, seed: int, num_demonstrations: int) -> list[Episode]:
-    """Plan in the scene of ``seed`` and execute what the policy wants executed, each from a fresh reset.
+def roll_out(task: Task, policy: Policy, observation: Observation, seed: int, num_demonstrations: int) -> list[Episode]:
+    """Plan from ``observation`` and execute what the policy wants executed, each from a fresh reset to ``seed``.
 
+    Methods that share an instant policy share its samples if they are given the same observation object.
     A plan that cannot be made, or that the arm refuses, is a failed episode, not an error.
     """
-    observation = task.reset(seed)
     about = {"task": task.name, "method": policy.name, "demos": num_demonstrations, "seed": seed}
     start = time.perf_counter()
     try:
@@ -35,8 +36,7 @@ def roll_out(task: Task, policy: Policy, seed: int, num_demonstrations: int) -> 
         ]
     episodes = []
     for index, trajectory in enumerate(policy.executions(plan)):
-        if index:
-            task.reset(seed)
+        task.reset(seed)
         try:
             execution = task.execute(trajectory)
             success, seconds, failure = execution.success, execution.seconds, execution.failure

@@ -1,0 +1,233 @@
+"""The command ``rip``. Exit 0: the work was done; 1: something broke; 2: wrong usage."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from robust_instant_policy import __version__
+from robust_instant_policy.errors import RipError, UsageError
+
+Command = Callable[[argparse.Namespace], int]
+DEFAULT_DATA = Path("data")
+DEFAULT_RUNS = Path("runs")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command line and return its exit status; errors become one line on standard error."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except KeyboardInterrupt:
+        print("rip: stopped; what was finished is kept, run the same command again to go on", file=sys.stderr)
+        return 1
+    except RipError as error:
+        if options.debug:
+            raise
+        print(f"rip: {error}", file=sys.stderr)
+        return error.exit_code
+    except OSError as error:
+        if options.debug:
+            raise
+        print(f"rip: {_words_for(error)}", file=sys.stderr)
+        return 1
+    except Exception as error:
+        if options.debug:
+            raise
+        print(f"rip: unexpected {type(error).__name__}: {error} (--debug shows where)", file=sys.stderr)
+        return 1
+
+
+def _words_for(error: OSError) -> str:
+    where = f" at {error.filename}" if error.filename else ""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"no space left{where}; free some and run the same command again to go on"
+    return f"{error.strerror or error}{where}"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="rip", description="Robust Instant Policy: show a robot a task a few times; it does it at once."
+    )
+    parser.add_argument("--version", action="version", version=f"rip {__version__}")
+    parser.add_argument("--debug", action="store_true", help="show a traceback when something breaks")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    def command(name: str, run: Command, summary: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=summary, description=summary)
+        added.set_defaults(run=run)
+        added.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+        return added
+
+    demo = command("demo", _demo, "record demonstrations, plan in a new scene, execute, explain")
+    demo.add_argument("--task", default="push-cube", help="task to show (default: %(default)s)")
+    demo.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
+    demo.add_argument("--seed", type=_natural, default=0, help="which new scene (default: %(default)s)")
+    demo.add_argument("--demos", default="10", metavar="N|DIR", help="how many demonstrations, or a folder of them")
+    demo.add_argument("--out", type=Path, help="run folder (default: runs/TASK-SEED)")
+    _method_options(demo)
+
+    record = command("record", _record, "record demonstrations into a dataset folder")
+    record.add_argument("--task", required=True)
+    record.add_argument("--episodes", type=_positive, default=10)
+    record.add_argument("--seed", type=_natural, default=0, help="where a new folder starts drawing scenes")
+    record.add_argument("--images", action="store_true", help="keep the camera's images along the way")
+    record.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+    plan = command("plan", _plan, "plan for one observation and write plan.json; nothing moves")
+    plan.add_argument("--demos", required=True, metavar="DIR")
+    plan.add_argument(
+        "--observation", required=True, metavar="FILE", help=".npz with rgb, depth, intrinsics, camera_pose"
+    )
+    plan.add_argument("--llm", default="embedded")
+    plan.add_argument("--queries", type=_positive, default=5, metavar="Q")
+    plan.add_argument("--out", type=Path, default=Path("plan.json"), metavar="FILE")
+    _method_options(plan)
+
+    evaluate = command("eval", _eval, "success rates of methods over tasks; goes on where it stopped")
+    evaluate.add_argument("--tasks", nargs="+", default=["push-cube"], metavar="TASK")
+    evaluate.add_argument("--methods", nargs="+", default=["rip", "rip-gauss", "kat"], metavar="METHOD")
+    evaluate.add_argument("--demos", type=_positive, default=10, metavar="N")
+    evaluate.add_argument("--episodes", type=_positive, default=10, metavar="N")
+    evaluate.add_argument("--queries", type=_positive, default=5, metavar="Q")
+    evaluate.add_argument("--seed", type=_natural, default=0)
+    evaluate.add_argument("--llm", default="embedded")
+    evaluate.add_argument("--replay", action="store_true", help="answer from the stored samples only, without a model")
+    evaluate.add_argument("--out", type=Path, required=True, metavar="DIR")
+    _method_options(evaluate)
+
+    report = command("report", _report, "write the report of a run folder again")
+    report.add_argument("folder", type=Path, metavar="DIR")
+
+    command("doctor", _doctor, "what works on this machine, and what to do about what does not")
+    return parser
+
+
+def _method_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--frames", choices=("adaptive", "world"), default="adaptive")
+    parser.add_argument("--layout", choices=("factorised", "sequence"), default="factorised")
+    parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
+    parser.add_argument("--downsampling", choices=("masked", "uniform"), default="masked")
+
+
+def _method_settings(options: argparse.Namespace) -> dict[str, str]:
+    return {name: getattr(options, name) for name in ("frames", "layout", "features", "downsampling")}
+
+
+def _natural(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number, not {text!r}")
+    return int(text)
+
+
+def _positive(text: str) -> int:
+    if _natural(text) == 0:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return int(text)
+
+
+def _demo(options: argparse.Namespace) -> int:
+    if options.demos.isdecimal() and int(options.demos) == 0:
+        raise UsageError("--demos 0: show the task at least once")
+    from robust_instant_policy.demo import run_demo
+
+    out = options.out or DEFAULT_RUNS / f"{options.task}-{options.seed}"
+    run_demo(options.task, options.llm, options.seed, options.demos, out, DEFAULT_DATA, _method_settings(options))
+    return 0
+
+
+def _record(options: argparse.Namespace) -> int:
+    from robust_instant_policy.console import StageConsole
+    from robust_instant_policy.datasets import DatasetWriter
+    from robust_instant_policy.tasks import make_task
+    from robust_instant_policy.tasks.record import record
+
+    screen = StageConsole()
+    task = make_task(options.task)
+    try:
+        with (
+            screen.stage(f"{options.episodes} demonstrations"),
+            DatasetWriter(options.out, task=task.name, description=task.description, rate_hz=task.record_hz) as writer,
+        ):
+            thrown_away = record(
+                task,
+                writer,
+                options.episodes,
+                seed=options.seed,
+                with_images=options.images,
+                on_progress=lambda there, count, _: screen.done_so_far("recording", there, count),
+            )
+    finally:
+        task.close()
+    screen.say(
+        f"{options.out}: {options.episodes} demonstrations of {task.name}, {thrown_away} failed attempts thrown away"
+    )
+    return 0
+
+
+def _plan(options: argparse.Namespace) -> int:
+    from robust_instant_policy.console import StageConsole
+    from robust_instant_policy.datasets import load_demonstrations
+    from robust_instant_policy.demonstration import Observation
+    from robust_instant_policy.llm import connect
+    from robust_instant_policy.policies import InstantPolicy, RobustInstantPolicy
+
+    screen = StageConsole()
+    observation = Observation.load(options.observation)
+    demonstrations = load_demonstrations(options.demos)
+    with screen.stage(f"language model ({options.llm})"):
+        model = connect(options.llm)
+    try:
+        instant = InstantPolicy(model, progress=screen.done_so_far, **_method_settings(options))
+        policy = RobustInstantPolicy(instant, num_queries=options.queries)
+        with screen.stage("keypoints of the demonstrations"):
+            policy.fit(demonstrations)
+        with screen.stage("plan"):
+            plan = policy.plan(observation)
+    finally:
+        model.close()
+    plan.save(options.out)
+    screen.say(f"{options.out}: {len(plan.trajectory)} steps, confidence {plan.confidence:.2f}")
+    return 0
+
+
+def _eval(options: argparse.Namespace) -> int:
+    from robust_instant_policy.evaluate import evaluate
+    from robust_instant_policy.evaluation import Experiment
+
+    experiment = Experiment(
+        tasks=options.tasks,
+        methods=options.methods,
+        num_demonstrations=options.demos,
+        num_episodes=options.episodes,
+        seed=options.seed,
+        num_queries=options.queries,
+    )
+    evaluate(experiment, options.llm, options.replay, options.out, DEFAULT_DATA, _method_settings(options))
+    return 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    from robust_instant_policy.report import write_report
+
+    print(write_report(options.folder))
+    return 0
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from robust_instant_policy.doctor import examine
+
+    healthy = True
+    for finding in examine(Path.cwd()):
+        healthy &= finding.works
+        mark = "ok  " if finding.works else "FAIL"
+        advice = "" if finding.works or not finding.remedy else f"\n      → {finding.remedy}"
+        print(f"{mark}  {finding.name:<20}{finding.detail}{advice}", flush=True)
+    return 0 if healthy else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,60 @@
+"""What the command prints while it works: one line a finished stage, a moving bar for the one under way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from robust_instant_policy.policies.policy import Stage
+
+
+class StageConsole:
+    """Prints stages with their times and remembers them in ``stages``."""
+
+    def __init__(self) -> None:
+        self.console = Console(highlight=False, soft_wrap=True)
+        self.stages: list[Stage] = []
+        self._bar: Progress | None = None
+
+    def say(self, line: str) -> None:
+        self.console.print(line, markup=False)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage, with a moving bar on a terminal; a stage that raises is not counted."""
+        self.done_so_far(name, 0, 0)
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._clear()
+        seconds = time.perf_counter() - start
+        self.stages.append(Stage(name, seconds))
+        self.say(f"  {name:<34}{seconds:7.1f} s")
+
+    def done_so_far(self, name: str, done: int, total: int) -> None:
+        """Move the bar; a `Progress` for the policies."""
+        if not self.console.is_terminal:
+            return
+        if self._bar is None:
+            self._bar = Progress(
+                SpinnerColumn(),
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                console=self.console,
+                transient=True,
+            )
+            self._bar.add_task(name, total=None)
+            self._bar.start()
+        self._bar.update(self._bar.task_ids[0], description=name, completed=done, total=total or None)
+
+    def _clear(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None

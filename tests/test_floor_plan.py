@@ -1,0 +1,54 @@
+"""The floor plan: imports run downward only, and importing the package needs no extra."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import robust_instant_policy
+
+ROOT = Path(robust_instant_policy.__file__).parent
+PACKAGE = "robust_instant_policy"
+FLOORS = {
+    "errors": 1, "geometry": 1, "trajectory": 1, "demonstration": 1, "query": 1,
+    "perception": 2, "context": 2, "llm": 2, "regression": 2, "datasets": 2,
+    "policies": 3, "tasks": 3,
+    "evaluation": 4,
+    "cli": 5, "report": 5, "demo": 5, "doctor": 5, "console": 5, "evaluate": 5,
+}  # fmt: skip
+
+
+def room(path: Path) -> str:
+    return path.relative_to(ROOT).parts[0].removesuffix(".py")
+
+
+def imported_rooms(path: Path) -> set[str]:
+    names = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names.append(node.module)
+        elif isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+    return {name.split(".")[1] for name in names if name.startswith(PACKAGE + ".")}
+
+
+MODULES = sorted(path for path in ROOT.rglob("*.py") if path.parent != ROOT or path.stem != "__init__")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_run_downward_only(path):
+    own = room(path)
+    for other in imported_rooms(path) - {own}:
+        allowed = FLOORS[other] < FLOORS[own] or FLOORS[own] == FLOORS[other] in (1, 5)
+        assert allowed, f"{own} (floor {FLOORS[own]}) imports {other} (floor {FLOORS[other]})"
+
+
+def test_importing_the_package_loads_no_heavy_dependency():
+    code = (
+        "import sys, robust_instant_policy as rip; rip.Trajectory; rip.RobustInstantPolicy; rip.connect;"
+        "heavy = {'torch', 'mani_skill', 'sapien', 'xllamacpp', 'transformers', 'mink', 'mujoco'} & set(sys.modules);"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
