@@ -1,0 +1,6 @@
+"""RGB-D images to 3-D keypoints that all demonstrations share."""
+
+from robust_instant_policy.perception.keypoints import KeypointExtractor, Located
+from robust_instant_policy.perception.settings import PAPER_REAL, PAPER_SIMULATION, DescriptorSettings
+
+__all__ = ["PAPER_REAL", "PAPER_SIMULATION", "DescriptorSettings", "KeypointExtractor", "Located"]

@@ -1,0 +1,51 @@
+"""Depth as real cameras give it: holes, flying pixels at edges, sometimes millimetres."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robust_instant_policy.geometry import FloatArray
+
+MILLIMETRES_ABOVE = 20.0  # a median depth beyond 20 "metres" is millimetres: arms do not reach that far
+SURFACE_TOLERANCE = 0.015  # share of the depth within which neighbouring readings are one surface
+MIN_SUPPORT = 3  # readings of a surface below which it is taken for flying pixels
+
+
+def in_metres(depth: ArrayLike) -> tuple[NDArray[np.float32], str]:
+    """Depth with NaN for every missing reading, in metres, and a line that says so if it was in millimetres."""
+    depth = np.array(depth, dtype=np.float32)
+    depth[~np.isfinite(depth) | (depth <= 0)] = np.nan
+    if np.isfinite(depth).any() and np.nanmedian(depth) > MILLIMETRES_ABOVE:
+        return depth / 1000, f"depth with a median of {np.nanmedian(depth):.0f} was read as millimetres"
+    return depth, ""
+
+
+def surface_depth(depth: NDArray[np.float32], pixels: ArrayLike, radius: int = 2) -> FloatArray:
+    """Depth ``(N,)`` of the surface seen at ``pixels (N, 2)``, in the unit of ``depth``; NaN where there is none.
+
+    The readings within ``radius`` pixels are split into surfaces wherever they jump by more than
+    `SURFACE_TOLERANCE`. The surface of the centre pixel counts if at least `MIN_SUPPORT` readings belong to it,
+    otherwise (a hole, a flying pixel) the one with the most readings, the nearer of two. The answer is its median.
+    """
+    height, width = depth.shape
+    centre = np.rint(np.asarray(pixels, dtype=np.float64)).astype(np.intp)
+    offsets = np.arange(-radius, radius + 1)
+    rows = centre[:, 1, None, None] + offsets[:, None]
+    cols = centre[:, 0, None, None] + offsets
+    inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
+    windows = np.where(inside, depth[rows.clip(0, height - 1), cols.clip(0, width - 1)], np.nan)
+    windows = windows.reshape(len(centre), -1)
+    middle = windows[:, windows.shape[1] // 2]
+    result = np.full(len(centre), np.nan)
+    for index, (window, value) in enumerate(zip(windows, middle, strict=True)):
+        readings = np.sort(window[np.isfinite(window)])
+        if len(readings) < MIN_SUPPORT:
+            continue
+        jumps = np.flatnonzero(np.diff(readings) > SURFACE_TOLERANCE * readings[:-1]) + 1
+        surfaces = [part for part in np.split(readings, jumps) if len(part) >= MIN_SUPPORT]
+        if not surfaces:
+            continue
+        own = [part for part in surfaces if part[0] <= value <= part[-1]]
+        result[index] = np.median(own[0] if own else max(surfaces, key=len))
+    return result

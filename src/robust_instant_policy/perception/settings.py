@@ -1,0 +1,29 @@
+"""How descriptors are computed: the paper's two parameter columns by name (Oh et al. 2025, Table III)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class DescriptorSettings:
+    """Everything that decides which numbers an image turns into.
+
+    ``load_size``: the shorter edge of the loaded image in pixels. ``stride``: pixels of the loaded image between
+    neighbouring patches, a divisor of the patch size. ``layer``: the transformer block, counted from 0.
+    ``facet``: ``"key"``, ``"query"``, ``"value"`` or ``"token"``. ``log_bins``: gather the surroundings of a
+    patch into its descriptor. ``saliency_threshold``: patches below it, in [0, 1], are background.
+    ``model``: a name on the hub, a folder or a safetensors file.
+    """
+
+    load_size: int
+    stride: int
+    layer: int = 9
+    facet: str = "key"
+    log_bins: bool = True
+    saliency_threshold: float = 0.15
+    model: str = "facebook/dino-vits8"
+
+
+PAPER_SIMULATION = DescriptorSettings(load_size=100, stride=2)
+PAPER_REAL = DescriptorSettings(load_size=240, stride=4)
