@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 
 from robust_instant_policy.datasets import DatasetWriter, VideoWriter, load_demonstrations, load_frames
 from robust_instant_policy.datasets.images import encode_depth, read_depth
-from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.errors import DatasetError, InvalidValueError, NoDemonstrationsError
 from robust_instant_policy.trajectory import Trajectory
 
 
@@ -182,6 +182,18 @@ def test_zero_demonstrations_are_refused(folder, tmp_path):
     assert "at least one" in refusal(load_demonstrations, folder, limit=0)
     writer_of(tmp_path / "begun").close()
     assert "no finished demonstration" in refusal(load_demonstrations, tmp_path / "begun")
+
+
+def test_only_a_folder_in_which_nothing_was_recorded_invites_recording(folder, tmp_path):
+    writer_of(tmp_path / "begun").close()
+    (tmp_path / "empty").mkdir()
+    for name in ("begun", "empty", "missing"):
+        with pytest.raises(NoDemonstrationsError):
+            load_demonstrations(tmp_path / name)
+    (folder / "data/chunk-000/file-000.parquet").unlink()
+    with pytest.raises(DatasetError) as caught:
+        load_demonstrations(folder)
+    assert not isinstance(caught.value, NoDemonstrationsError)
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,10 @@ class DatasetError(RipError):
     """A demonstrations folder that is missing, empty, half-written or of another task."""
 
 
+class NoDemonstrationsError(DatasetError):
+    """A demonstrations folder in which nothing was recorded so far; recording may begin or go on there."""
+
+
 class KeypointError(RipError):
     """The images show too little in common, or too little of it has depth."""
 

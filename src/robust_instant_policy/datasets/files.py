@@ -6,6 +6,7 @@ import contextlib
 import errno
 import fcntl
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from robust_instant_policy.errors import DatasetError
@@ -42,6 +43,11 @@ def make_folder(path: Path) -> None:
     make_folder(path.parent)
     path.mkdir(exist_ok=True)
     _sync_folder(path.parent)
+
+
+def finished_files(path: Path) -> Iterator[Path]:
+    """The files below ``path`` but those left under way by a killed process."""
+    return (file for file in path.rglob("*") if file.is_file() and not file.name.endswith(PART_SUFFIX))
 
 
 def write_error(path: Path, error: OSError) -> DatasetError:

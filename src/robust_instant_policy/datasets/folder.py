@@ -15,8 +15,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
+from robust_instant_policy.datasets.files import finished_files
 from robust_instant_policy.datasets.video import decode_video
-from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.errors import DatasetError, NoDemonstrationsError
 
 CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
 INFO_ENTRIES = ("codebase_version", "fps", "features", "total_episodes", "total_frames", "data_path")
@@ -83,14 +84,14 @@ def open_folder(path: Path, task: str | None = None) -> Folder:
     """
     advice = f"record demonstrations with: rip record --task {task or 'TASK'} --episodes 10 --out {path}"
     if not path.exists():
-        raise DatasetError(f"there is no folder {path}; {advice}")
+        raise NoDemonstrationsError(f"there is no folder {path}; {advice}")
     if not path.is_dir():
         raise DatasetError(f"{path} is a file, not a demonstrations folder; {advice}")
-    if not any(path.iterdir()):
-        raise DatasetError(f"{path} is empty; {advice}")
+    if not any(finished_files(path)):
+        raise NoDemonstrationsError(f"{path} is empty; {advice}")
     if not (path / layout.INFO_PATH).exists():
         if (path / layout.RIP_PATH).exists():
-            raise DatasetError(f"{path} holds no finished demonstration yet; go on with the recording, or {advice}")
+            raise NoDemonstrationsError(f"{path} holds no finished demonstration yet; {advice}")
         raise DatasetError(f"{path} is no demonstrations folder: it has no {layout.INFO_PATH}; {advice}")
     info = read_json(path / layout.INFO_PATH)
     missing = [entry for entry in INFO_ENTRIES if entry not in info]
@@ -104,7 +105,7 @@ def open_folder(path: Path, task: str | None = None) -> Folder:
             + (convert if version == "v2.1" else "")
         )
     if info["total_episodes"] < 1:
-        raise DatasetError(f"{path} holds no demonstrations; {advice}")
+        raise NoDemonstrationsError(f"{path} holds no demonstrations; {advice}")
     return Folder(path, info, _read_episodes(path, info["total_episodes"]))
 
 

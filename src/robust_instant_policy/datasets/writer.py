@@ -16,7 +16,14 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.files import PART_SUFFIX, lock_folder, make_folder, write_error, write_whole
+from robust_instant_policy.datasets.files import (
+    PART_SUFFIX,
+    finished_files,
+    lock_folder,
+    make_folder,
+    write_error,
+    write_whole,
+)
 from robust_instant_policy.datasets.folder import Folder, open_folder, read_json
 from robust_instant_policy.datasets.images import encode_depth, encode_png
 from robust_instant_policy.datasets.statistics import Statistics, combine, feature_statistics, image_statistics
@@ -119,9 +126,9 @@ class DatasetWriter:
             self._folder = self._finished()
             self._remove_unfinished()
             return
-        strangers = [file for file in self.path.rglob("*") if file.is_file() and not file.name.endswith(PART_SUFFIX)]
-        if strangers:
-            raise DatasetError(f"{self.path} holds other files ({strangers[0].name}); choose an empty or a new folder")
+        stranger = next(finished_files(self.path), None)
+        if stranger is not None:
+            raise DatasetError(f"{self.path} holds other files ({stranger.name}); choose an empty or a new folder")
         self._folder = None
         self._write_own([])
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
-from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.errors import NoDemonstrationsError
 from robust_instant_policy.evaluation.episodes import Episode, EpisodeTable
 from robust_instant_policy.evaluation.rollout import roll_out
 from robust_instant_policy.evaluation.table import success_table
@@ -35,10 +35,7 @@ def obtain_demonstrations(
     """
     try:
         there = len(load_demonstrations(folder, task=task.name))
-    except DatasetError:
-        # Only a folder with nothing in it may be recorded into; anything else is the user's and stays.
-        if folder.exists() and any(folder.iterdir()):
-            raise
+    except NoDemonstrationsError:
         there = 0
     if there < count:
         with DatasetWriter(folder, task=task.name, description=task.description, rate_hz=task.record_hz) as writer:
