@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.ndimage import label, maximum_filter, uniform_filter
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError
@@ -23,26 +21,43 @@ TABLE_TOLERANCE = 0.006  # metres; points this near to the plane belong to it
 LIFTED = 0.010  # metres above the table from which a point belongs to an object
 PLANE_SAMPLES = 60
 SALIENT = 0.5  # saliency from which a flat point counts as an object
-COLOURED = 0.06  # distance from the table's chromaticity that a flat point needs too, so that shadows do not count
-BRIGHTER = 0.08  # or its brightness above the table's: shadows only darken
-PIECE_GAP = 0.02  # metres on the table; foreground points further apart belong to different objects
+STRANGE = 4.0  # deviations from the table's colour that the surroundings of a flat point need too
+STRANGE_ITSELF = 2.5  # and the point itself, so that objects have no halo
+INLIER_DEVIATIONS = 3.0
+GAUSSIAN_ROUNDS = 4
+COLOUR_NOISE = 0.02  # of a channel's range; less is the camera's noise
+SMOOTH_PX = 5  # evens out the grain of the table
+MIN_FLAT = 100
+PIECE_GAP_M = 0.02  # foreground points further apart in the image belong to different objects
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
     """Foreground points of an image: ``points (N, 3)`` metres, world; ``colours (N, 3)`` in [0, 1];
-    ``pixels (N, 2)`` (u, v); ``cells (N,)`` of the descriptor map they lie in.
+    ``pixels (N, 2)`` (u, v); ``cells (N,)`` of the descriptor map they lie in; ``pieces (N,)`` numbers the
+    connected pieces they form in the image.
     """
 
     points: FloatArray
     colours: FloatArray
     pixels: FloatArray
     cells: NDArray[np.intp]
+    pieces: NDArray[np.intp]
 
 
-def chromaticity(colours: FloatArray) -> FloatArray:
-    """Colour without brightness ``(..., 3)``: the shares of red, green and blue."""
-    return (colours + 0.02) / (colours + 0.02).sum(axis=-1, keepdims=True)
+def strangeness(colours: FloatArray) -> FloatArray:
+    """How many deviations ``(N,)`` each of ``colours (N, 3)`` lies from the commonest colour, shadows aside.
+
+    The commonest colour is a Gaussian fitted to what remains after dropping outliers; a darker point is first
+    brightened to its mean, since a shadow is the same colour, darker.
+    """
+    kept = colours
+    for _ in range(GAUSSIAN_ROUNDS):
+        mean = np.median(kept, axis=0)
+        whiten = np.linalg.inv(np.linalg.cholesky(np.cov(kept.T) + COLOUR_NOISE**2 * np.eye(3)))
+        kept = kept[(((kept - mean) @ whiten.T) ** 2).sum(axis=1) < INLIER_DEVIATIONS**2]
+    lit = colours * np.maximum(mean.mean() / np.maximum(colours.mean(axis=1), COLOUR_NOISE), 1)[:, None]
+    return np.sqrt((((lit - mean) @ whiten.T) ** 2).sum(axis=1))
 
 
 def table_plane(points: FloatArray, seed: int) -> FloatArray:
@@ -89,8 +104,8 @@ def foreground(
         steady[tuple(first)] += near
         steady[tuple(second)] += near
     rows, cols = np.nonzero(np.isfinite(depth[::every, ::every]) & (steady[::every, ::every] >= MIN_NEIGHBOURS))
-    if len(rows) < 10:
-        raise KeypointError("fewer than 10 pixels have a steady depth; check the camera's depth stream")
+    if len(rows) < MIN_FLAT:
+        raise KeypointError(f"fewer than {MIN_FLAT} pixels have a steady depth; check the camera's depth stream")
     pixels = np.stack([cols, rows], axis=1) * float(every)
     index = pixels.astype(np.intp)
     points = lift(pixels, depth[index[:, 1], index[:, 0]], observation.intrinsics, observation.camera_pose)
@@ -104,16 +119,16 @@ def foreground(
     above = points @ plane[:3] + plane[3]
     flat = np.abs(above) < LIFTED
     cells = descriptors.cells_at(pixels)
-    table = np.median(colours[flat], axis=0) if flat.any() else np.median(colours, axis=0)
-    coloured = np.linalg.norm(chromaticity(colours) - chromaticity(table), axis=1) > COLOURED
-    brighter = colours.mean(axis=1) > table.mean() + BRIGHTER
-    stands_out = (descriptors.saliency.reshape(-1)[cells] > SALIENT) & (coloured | brighter)
+    smooth = uniform_filter(observation.rgb / np.float32(255), size=(SMOOTH_PX, SMOOTH_PX, 1))
+    strange = np.zeros(len(points), dtype=bool)
+    if flat.sum() > MIN_FLAT:
+        evened = strangeness(smooth[index[flat, 1], index[flat, 0]])
+        strange[flat] = (evened > STRANGE) & (strangeness(colours[flat]) > STRANGE_ITSELF)
+    stands_out = strange & (descriptors.saliency.reshape(-1)[cells] > SALIENT)
     chosen = (above > LIFTED) | (flat & stands_out)
-    return Cloud(points[chosen], colours[chosen], pixels[chosen], cells[chosen]), note
-
-
-def pieces(points: FloatArray) -> NDArray[np.intp]:
-    """Number of the object each of ``points (N, 3)`` belongs to; seen from above, gaps part objects."""
-    pairs = cKDTree(points[:, :2]).query_pairs(PIECE_GAP, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
-    return connected_components(graph, directed=False)[1].astype(np.intp)
+    mask = np.zeros(depth[::every, ::every].shape, dtype=bool)
+    place = index[chosen, 1] // every, index[chosen, 0] // every
+    mask[place] = True
+    gap = PIECE_GAP_M * observation.intrinsics[0, 0] / np.median(depth[index[chosen, 1], index[chosen, 0]]) / every
+    piece = label(maximum_filter(mask, size=max(1, round(gap))))[0][place] - 1
+    return Cloud(points[chosen], colours[chosen], pixels[chosen], cells[chosen], piece), note

@@ -12,15 +12,16 @@ from scipy.spatial import cKDTree
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError
 from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
-from robust_instant_policy.perception.cloud import Cloud, foreground, pieces
+from robust_instant_policy.perception.cloud import Cloud, foreground
 from robust_instant_policy.perception.descriptors import DescriptorMap, IntArray
 from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors
-from robust_instant_policy.perception.registration import COLOUR_SCALE, Registration, polish, vote
+from robust_instant_policy.perception.registration import polish, proposals
 from robust_instant_policy.perception.settings import PAPER_SIMULATION, DescriptorSettings
 
 MIN_FIT = 0.15  # share of an object's points that must be explained in every demonstration
 MIN_OBJECT_POINTS = 25
 MAX_OBJECT_POINTS = 300
+MAX_PIECE_POINTS = 600
 MAX_OBJECT_CELLS = 80
 
 
@@ -43,9 +44,21 @@ class _View:
     observation: Observation
     descriptors: DescriptorMap
     cloud: Cloud
-    tree: cKDTree
+    points: FloatArray  # an even choice of the cloud's points
+    colours: FloatArray
     cells: IntArray  # cells with foreground in them
     cell_points: FloatArray  # their mean points
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Where an object is in an image: ``pose (4, 4)`` from the reference image's world to the image's;
+    ``fit`` of its points and ``agreement`` of its descriptors, in [0, 1].
+    """
+
+    pose: FloatArray
+    fit: float
+    agreement: float
 
 
 @dataclass(eq=False)
@@ -57,13 +70,26 @@ class _Body:
     seen: list[tuple[_View, IntArray, FloatArray]]
 
     def find(self, view: _View) -> Registration:
-        source = np.concatenate([points for _, _, points in self.seen])
         similar = np.concatenate(
             [other.descriptors.similarities(cells, view.descriptors, view.cells) for other, cells, _ in self.seen]
         )
-        motions = vote(source, view.cell_points, similar)
-        found = [polish(motion, self.points, self.colours, view.tree) for motion in motions]
-        return max(found, key=lambda registration: registration.fit)
+        source = np.concatenate([points for _, _, points in self.seen])
+        motions = proposals(source, view.cell_points, similar)
+        motions, fits = polish(motions, self.points, self.colours, view.points, view.colours)
+        agreements = np.array([self._agreement(motion, view, similar) for motion in motions])
+        best = int((fits + agreements).argmax())
+        return Registration(motions[best], float(fits[best]), float(agreements[best]))
+
+    def _agreement(self, motion: FloatArray, view: _View, similar: FloatArray) -> float:
+        """Mean similarity of the object's descriptors with those where ``motion`` puts them, best demonstration."""
+        moved = [transform_points(motion, points) for _, _, points in self.seen]
+        pixels = project(np.concatenate(moved), view.observation.intrinsics, view.observation.camera_pose)
+        column = np.full(view.descriptors.grid[0] * view.descriptors.grid[1], -1)
+        column[view.cells] = np.arange(len(view.cells))
+        where = column[view.descriptors.cells_at(pixels)]
+        value = np.where(where >= 0, np.take_along_axis(similar, where[:, None].clip(0), axis=1)[:, 0], 0)
+        ends = np.cumsum([len(points) for points in moved])[:-1]
+        return max(float(part.mean()) for part in np.split(value, ends))
 
     def remember(self, view: _View, registration: Registration, seed: int) -> None:
         """Add the cells of ``view`` in which the object lies to what it is recognised by."""
@@ -157,13 +183,20 @@ class KeypointExtractor:
             raise KeypointError("nothing stands out from the table in an image; is the object in the workspace?")
         cells, inverse, counts = np.unique(cloud.cells, return_inverse=True, return_counts=True)
         sums = np.stack([np.bincount(inverse, cloud.points[:, axis]) for axis in range(3)], axis=1)
-        tree = cKDTree(np.concatenate([cloud.points, cloud.colours * COLOUR_SCALE], axis=1))
-        return _View(observation, descriptors, cloud, tree, cells, sums / counts[:, None]), note
+        kept = np.concatenate(
+            [
+                thin(np.flatnonzero(cloud.pieces == piece), MAX_PIECE_POINTS, self.seed)
+                for piece in np.unique(cloud.pieces)
+            ]
+        )
+        return _View(
+            observation, descriptors, cloud, cloud.points[kept], cloud.colours[kept], cells, sums / counts[:, None]
+        ), note
 
     def _bodies(self, views: list[_View]) -> tuple[list[_Body], list[list[FloatArray]]]:
         """The objects of the first image that are found in all others, with their poses in each."""
         reference = views[0]
-        label = pieces(reference.cloud.points)
+        label = reference.cloud.pieces
         bodies, poses, best = [], [], 0.0
         for piece in range(label.max() + 1):
             members = np.flatnonzero(label == piece)
@@ -171,8 +204,8 @@ class KeypointExtractor:
                 continue
             members = thin(members, MAX_OBJECT_POINTS, self.seed)
             body = _Body(reference.cloud.points[members], reference.cloud.colours[members], [])
-            body.remember(reference, Registration(np.eye(4), 1.0), self.seed)
-            found: dict[int, Registration] = {0: Registration(np.eye(4), 1.0)}
+            body.remember(reference, Registration(np.eye(4), 1.0, 1.0), self.seed)
+            found: dict[int, Registration] = {0: Registration(np.eye(4), 1.0, 1.0)}
             while len(found) < len(views):
                 tries = {i: body.find(view) for i, view in enumerate(views) if i not in found}
                 index = max(tries, key=lambda i: tries[i].fit)
