@@ -45,9 +45,9 @@ class Task(Protocol):
     """A scene, a robot in it, and a person who can show what to do.
 
     ``description`` says what is to be done, in one sentence, and ``goal`` what is true once it is done
-    ("the cube is in the goal"). ``workspace (2, 3)`` are the lower and upper corner, in metres, of the volume in which the arm works;
-    keypoints outside it mean nothing. ``record_hz`` and ``execute_hz`` are the rates of demonstrations and
-    of the waypoints played back.
+    ("the cube is in the goal"). ``workspace (2, 3)`` are the lower and upper corner, in metres, of the volume in
+    which the arm works; keypoints outside it mean nothing. ``record_hz`` and ``execute_hz`` are the rates of
+    demonstrations and of the waypoints played back, ``video_hz`` that of the frames `execute` hands out.
     """
 
     name: str
@@ -55,6 +55,7 @@ class Task(Protocol):
     goal: str
     record_hz: float
     execute_hz: float
+    video_hz: float
     workspace: FloatArray
 
     def reset(self, seed: int) -> Observation:

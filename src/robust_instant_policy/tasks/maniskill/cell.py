@@ -1,0 +1,128 @@
+"""The cell all tasks share: table, arm, top-view RGB-D camera, and a camera for videos.
+
+The world's origin is on the table top, x away from the robot, z up. The image's top points along +x.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.scene_builder.table import TableSceneBuilder
+from mani_skill.utils.structs.types import SimConfig
+
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.geometry import FloatArray, make_pose
+from robust_instant_policy.tasks.maniskill.robot import FINGER_TRAVEL_M, UR5eHandE
+from robust_instant_policy.tasks.maniskill.scene_truth import SceneTruth
+
+RECORD_HZ = 55.0  # "recorded at 55 Hz" (Oh et al. 2025, Sec. V-A)
+SIM_HZ = 220
+
+BASE_POSITION_M = (-0.5, 0.0, 0.0)
+HOME_JOINTS = (0.9, -1.9, 2.2, -1.87, -1.5708, -0.67)  # beside the table top, out of the camera's sight
+
+CAMERA_POSITION_M = (0.06, 0.0, 1.3)
+CAMERA_VIEW_M = 0.8  # side of the square of table top that the camera sees
+CAMERA_PIXELS = 256
+VIDEO_WIDTH, VIDEO_HEIGHT = 480, 360
+
+WORKSPACE = np.array([[-0.34, -0.4, -0.005], [0.46, 0.4, 0.4]])
+
+
+class CellEnv(BaseEnv):
+    """Base of the five environments; a subclass adds its objects and says when they are where they should be."""
+
+    SUPPORTED_ROBOTS = ("ur5e_hande",)
+    SUPPORTED_REWARD_MODES = ("sparse", "none")
+    agent: UR5eHandE
+
+    def __init__(self, *args: Any, robot_uids: str = "ur5e_hande", render_backend: str = "cpu", **kwargs: Any):
+        # A physics scene that has been used orders its contacts differently from a new one, and the same push then
+        # ends millimetres elsewhere: only a new scene at every reset makes the same seed give the same episode.
+        kwargs.setdefault("reconfiguration_freq", 1)
+        super().__init__(*args, robot_uids=robot_uids, render_backend=render_backend, **kwargs)
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return SimConfig(sim_freq=SIM_HZ, control_freq=int(RECORD_HZ))
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        down, left, up = (0, 0, -1), (0, 1, 0), (1, 0, 0)
+        pose = sapien.Pose(make_pose(np.stack([down, left, up], axis=1), CAMERA_POSITION_M))
+        fov = 2 * np.arctan2(CAMERA_VIEW_M / 2, CAMERA_POSITION_M[2])
+        return [
+            CameraConfig("top", pose, CAMERA_PIXELS, CAMERA_PIXELS, fov=fov, near=0.05, far=5.0, shader_pack="default")
+        ]
+
+    @property
+    def _default_human_render_camera_configs(self) -> CameraConfig:
+        pose = sapien_utils.look_at(eye=(0.75, -0.75, 0.75), target=(-0.05, 0.05, 0.15))
+        return CameraConfig(
+            "render_camera", pose, VIDEO_WIDTH, VIDEO_HEIGHT, fov=0.9, near=0.05, far=20.0, shader_pack="default"
+        )
+
+    def _load_agent(self, options: dict) -> None:
+        super()._load_agent(options, sapien.Pose(p=BASE_POSITION_M))
+
+    def _load_scene(self, options: dict) -> None:
+        self.table_scene = TableSceneBuilder(env=self)
+        self.table_scene.build()
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        self.table_scene.initialize(env_idx)
+        home = np.array([*HOME_JOINTS, FINGER_TRAVEL_M, FINGER_TRAVEL_M], dtype=np.float32)
+        self.agent.reset(home)
+        self.agent.robot.set_pose(sapien.Pose(p=BASE_POSITION_M))
+
+    def _get_obs_extra(self, info: dict) -> dict:
+        return {"tcp_pose": self.agent.tcp.pose.raw_pose}
+
+    def photograph(self) -> Observation:
+        """What the top-view camera sees now."""
+        camera = self._sensors["top"]
+        self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        camera.capture()
+        images = camera.get_obs(rgb=True, depth=True, position=False, segmentation=False)
+        parameters = camera.get_params()
+        world_to_camera = parameters["extrinsic_cv"][0].cpu().numpy().astype(np.float64)
+        rotation = world_to_camera[:3, :3].T
+        intrinsics = parameters["intrinsic_cv"][0].cpu().numpy().astype(np.float64)
+        intrinsics[:2, 2] -= 0.5  # SAPIEN counts pixels from their corners, OpenCV from their centres
+        depth_mm = images["depth"][0, ..., 0].cpu().numpy()
+        return Observation(
+            rgb=images["rgb"][0].cpu().numpy().astype(np.uint8),
+            depth=depth_mm.astype(np.float32) / 1000.0,
+            intrinsics=intrinsics,
+            camera_pose=make_pose(rotation, -rotation @ world_to_camera[:3, 3]),
+        )
+
+    def scene_truth(self) -> SceneTruth:
+        """What each pixel of the top view shows, and where it is."""
+        camera = self._sensors["top"]
+        self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        camera.capture()
+        labels = camera.get_obs(rgb=False, depth=False, position=False, segmentation=True)["segmentation"]
+        entities = {actor._objs[0].per_scene_id: actor for actor in self.scene.actors.values()}
+        for articulation in self.scene.articulations.values():
+            entities |= {link._objs[0].entity.per_scene_id: link for link in articulation.links}
+        poses = [entity.pose.to_transformation_matrix()[0].cpu().numpy() for entity in entities.values()]
+        parts = np.full((CAMERA_PIXELS, CAMERA_PIXELS), -1)
+        for index, identity in enumerate(entities):
+            parts[labels[0, ..., 0].cpu().numpy() == identity] = index
+        names = tuple(entity.name for entity in entities.values())
+        return SceneTruth(parts, names, np.array(poses, dtype=np.float64))
+
+    def video_frame(self) -> np.ndarray:
+        """RGB frame ``(H, W, 3)`` uint8 of the camera beside the table."""
+        return self.render_rgb_array()[0].cpu().numpy().astype(np.uint8)
+
+    def tool_pose(self) -> FloatArray:
+        """Where the tool frame is, ``(4, 4)``."""
+        return self.agent.tcp.pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)

@@ -1,0 +1,101 @@
+"""A person's hand on a leader arm: strokes with their own path, speed, pauses and small errors.
+
+An expert says what to do as `Stroke`s; `perform` says how this person does it this time. Strokes between rests
+follow the minimum-jerk profile of human reaching (Flash and Hogan 1985).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from robust_instant_policy.geometry import FloatArray
+
+SPEED_SPREAD = 0.15  # of the log of an episode's and a stroke's speed
+MIN_STROKE_S = 0.35
+TURN_RADIUS_M = 0.12  # a turn of one radian takes as long as this many metres
+SKEW_SPREAD = 0.12  # of the log of the exponent that makes strokes start or end faster
+VIA_ERROR_M = 0.008
+AIM_ERROR_RAD = 0.02
+TREMOR_M = 0.0004
+TREMOR_HZ = (0.6, 3.5)
+TREMOR_WAVES = 4
+GRIP_PAUSE_S = (0.4, 0.65)  # the person watches the fingers close
+
+
+@dataclass(frozen=True, eq=False)
+class Stroke:
+    """One movement from rest to rest through tool ``poses (N, 4, 4)``, stopping at the last.
+
+    ``error`` is the spread, in metres, with which the person hits the last position; ``speed`` the usual mean
+    speed in m/s; ``pause`` the usual rest afterwards in seconds; ``closed`` the gripper state from then on.
+    """
+
+    poses: FloatArray
+    closed: bool
+    speed: float = 0.25
+    error: float = 0.002
+    pause: float = 0.08
+
+
+def perform(
+    start: FloatArray, strokes: Sequence[Stroke], rng: np.random.Generator, rate_hz: float
+) -> tuple[FloatArray, np.ndarray]:
+    """Tool poses ``(T, 4, 4)`` and gripper command ``(T,)`` bool at ``rate_hz``, from ``start`` with an open hand."""
+    pace = np.exp(rng.normal(0.0, SPEED_SPREAD))
+    poses, closed = [start[None]], [np.zeros(1, dtype=bool)]
+    here, shut = start, False
+    for stroke in strokes:
+        path = _move(here, stroke, pace, rng, rate_hz)
+        rest = stroke.pause * rng.uniform(0.3, 1.7)
+        poses.append(path)
+        closed.append(np.full(len(path), shut))
+        if stroke.closed != shut:
+            shut = stroke.closed
+            rest += rng.uniform(*GRIP_PAUSE_S)
+        here = path[-1]
+        poses.append(np.repeat(here[None], round(rest * rate_hz), axis=0))
+        closed.append(np.full(len(poses[-1]), shut))
+    whole = np.concatenate(poses)
+    whole[:, :3, 3] += _tremor(len(whole), rng, rate_hz)
+    return whole, np.concatenate(closed)
+
+
+def _move(here: FloatArray, stroke: Stroke, pace: float, rng: np.random.Generator, rate_hz: float) -> FloatArray:
+    knots = np.concatenate([here[None], stroke.poses])
+    spread = np.full(len(knots), VIA_ERROR_M)
+    spread[0], spread[-1] = 0.0, stroke.error
+    if len(knots) > 3:  # a drawn curve is followed, not cut: its points share one error
+        knots[1:, :3, 3] += rng.normal(0.0, stroke.error, 3)
+    else:
+        knots[:, :3, 3] += rng.normal(0.0, 1.0, (len(knots), 3)) * spread[:, None]
+    turn = Rotation.from_rotvec(rng.normal(0.0, AIM_ERROR_RAD, 3)).as_matrix()
+    knots[1:, :3, :3] = knots[1:, :3, :3] @ turn
+    rotations = Rotation.from_matrix(knots[:, :3, :3])
+    step = np.linalg.norm(np.diff(knots[:, :3, 3], axis=0), axis=1)
+    step = step + TURN_RADIUS_M * (rotations[:-1].inv() * rotations[1:]).magnitude()
+    along = np.concatenate([[0.0], np.cumsum(np.maximum(step, 1e-6))])
+    speed = stroke.speed * pace * np.exp(rng.normal(0.0, SPEED_SPREAD))
+    count = max(int(np.ceil(max(along[-1] / speed, MIN_STROKE_S) * rate_hz)), 2)
+    time = (np.arange(1, count + 1) / count) ** np.exp(rng.normal(0.0, SKEW_SPREAD))
+    at = along[-1] * (10 * time**3 - 15 * time**4 + 6 * time**5)
+    path = np.tile(np.eye(4), (count, 1, 1))
+    path[:, :3, 3] = CubicSpline(along, knots[:, :3, 3], bc_type="natural")(at)
+    path[:, :3, :3] = Slerp(along, rotations)(np.minimum(at, along[-1])).as_matrix()
+    return path
+
+
+def _tremor(length: int, rng: np.random.Generator, rate_hz: float) -> FloatArray:
+    """Small unsteadiness ``(length, 3)`` in metres, none at the first sample."""
+    time = np.arange(length) / rate_hz
+    waves = np.zeros((length, 3))
+    for _ in range(TREMOR_WAVES):
+        frequency = rng.uniform(*TREMOR_HZ)
+        phase = rng.uniform(0.0, 2 * np.pi, 3)
+        amplitude = rng.normal(0.0, TREMOR_M, 3)
+        waves += amplitude * (np.sin(2 * np.pi * frequency * time[:, None] + phase) - np.sin(phase))
+    return waves

@@ -1,0 +1,157 @@
+"""From waypoints to joint commands, with every check made before anything moves.
+
+home ──lead-in──▶ waypoint 0 ──1/5.5 s──▶ waypoint 1 ──▶ … ──▶ last ──settle──▶ judged
+                                 └ where the gripper state changes, the arm waits for the fingers
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation, Slerp
+
+from robust_instant_policy.errors import UnreachableError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.tasks.maniskill.kinematics import Kinematics
+from robust_instant_policy.tasks.maniskill.robot import FINGER_SPEED_M_S, FINGER_TRAVEL_M, PALM_TRIANGLE
+from robust_instant_policy.trajectory import Trajectory
+
+EXECUTE_HZ = 5.5  # "executed at 5.5 Hz" (Oh et al. 2025, Sec. V-A)
+LEAD_IN_SPEED_M_S = 0.35  # from home to the first waypoint
+GRIPPER_SECONDS = 0.45  # to open or close fully, with a margin
+SETTLE_SECONDS = 0.5  # at the last waypoint, before success is judged
+
+JOINT_SPEED_LIMIT_RAD_S = 0.8 * np.pi  # the joints' 180 degrees/s, with a margin for tracking
+FLIP_RAD = 0.6  # a joint change between commands 18 ms apart that only a leap across a singularity makes
+TOOL_SPEED_LIMIT_M_S = 1.0  # "typical TCP speed 1 m/s" (UR5e data sheet)
+REACH_TOLERANCE_M = 5e-3
+REACH_TOLERANCE_RAD = 0.05
+TABLE_TOLERANCE_M = 0.012  # fingertips commanded deeper than this into the table are refused
+TRIPLET_TOLERANCE_M = 0.05  # rms misfit beyond which three points are no gripper
+CLOSED = 0.5  # gripper states above this count as closed
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Commands, one a control step: joint angles ``(N, 6)`` rad, finger travel ``(N,)`` m.
+
+    ``poses (N, 4, 4)`` and ``closed (N,)`` bool are the tool poses and gripper states meant by them.
+    """
+
+    joints: FloatArray
+    fingers: FloatArray
+    poses: FloatArray
+    closed: np.ndarray
+
+
+def plan_waypoints(trajectory: Trajectory, kinematics: Kinematics, home: ArrayLike, rate_hz: float) -> Motion:
+    """Motion from the ``home`` joints along ``trajectory``'s waypoints, with stops where the gripper acts.
+
+    Raises `UnreachableError` naming the first waypoint that the arm cannot or must not go to.
+    """
+    if trajectory.num_arms != 1:
+        raise UnreachableError(f"the trajectory is for {trajectory.num_arms} arms, this cell has one")
+    triplets = trajectory.triplets[:, 0]
+    waypoints = PALM_TRIANGLE.poses(triplets)
+    misfit = np.sqrt(((PALM_TRIANGLE.triplets(waypoints) - triplets) ** 2).sum(axis=-1).mean(axis=-1))
+    _refuse(misfit > TRIPLET_TOLERANCE_M, "three points that are no gripper, {:.0f} mm off its shape", misfit * 1e3)
+    depth = -PALM_TRIANGLE.triplets(waypoints)[..., 2].min(axis=-1)
+    _refuse(depth > TABLE_TOLERANCE_M, "fingers {:.0f} mm inside the table", depth * 1e3)
+
+    closed = trajectory.gripper_state[:, 0] > CLOSED
+    lead_in = _lead_in(kinematics.tool_pose(home), waypoints[0])
+    knots, owner, times, command = [lead_in[0]], [0], [0.0], [False]
+    for pose in lead_in[1:]:
+        distance = float(np.linalg.norm(pose[:3, 3] - knots[-1][:3, 3]))
+        if distance > 0 or pose is lead_in[-1]:
+            knots.append(pose)
+            owner.append(0)
+            times.append(times[-1] + max(distance / LEAD_IN_SPEED_M_S, 1 / EXECUTE_HZ))
+            command.append(False)
+    for step, (pose, shut) in enumerate(zip(waypoints, closed, strict=True)):
+        if step:
+            distance = float(np.linalg.norm(pose[:3, 3] - knots[-1][:3, 3]))
+            knots.append(pose)
+            owner.append(step)
+            times.append(times[-1] + max(1 / EXECUTE_HZ, 2 * distance / TOOL_SPEED_LIMIT_M_S))
+            command.append(command[-1])
+        if shut != command[-1]:
+            command[-1] = bool(shut)
+            knots.append(pose)
+            owner.append(step)
+            times.append(times[-1] + GRIPPER_SECONDS)
+            command.append(bool(shut))
+    knots.append(knots[-1])
+    owner.append(owner[-1])
+    times.append(times[-1] + SETTLE_SECONDS)
+    command.append(command[-1])
+
+    at = np.arange(0.0, times[-1] + 0.5 / rate_hz, 1 / rate_hz).clip(max=times[-1])
+    poses = _smooth(np.array(times), np.array(knots), at)
+    state = np.array(command)[np.clip(np.searchsorted(times, at, side="right") - 1, 0, None)]
+    reached_for = np.array(owner)[np.clip(np.searchsorted(times, at, side="left"), 0, len(owner) - 1)]
+    return plan_poses(poses, state, kinematics, home, rate_hz, reached_for)
+
+
+def plan_poses(
+    poses: FloatArray,
+    closed: np.ndarray,
+    kinematics: Kinematics,
+    home: ArrayLike,
+    rate_hz: float,
+    steps: np.ndarray | None = None,
+) -> Motion:
+    """Motion through tool ``poses (N, 4, 4)`` at ``rate_hz``, slowed down where a joint would be too fast.
+
+    ``closed (N,)`` is the gripper command, ``steps (N,)`` the waypoint each pose leads to, for the error messages.
+    """
+    steps = np.arange(len(poses)) if steps is None else steps
+    path = kinematics.follow(poses, home)
+    _refuse(
+        (path.position_error > REACH_TOLERANCE_M) | (path.rotation_error > REACH_TOLERANCE_RAD),
+        "a pose the arm cannot reach, it stays {:.0f} mm short",
+        path.position_error * 1e3,
+        steps,
+    )
+    change = np.abs(np.diff(path.joints, axis=0, prepend=np.asarray(home)[None])).max(axis=1)
+    _refuse(change > FLIP_RAD, "an elbow or wrist that flips by {:.0f} degrees at once", np.rad2deg(change), steps)
+    count = np.maximum(np.ceil(change * rate_hz / JOINT_SPEED_LIMIT_RAD_S), 1).astype(int)
+    position = np.repeat(np.arange(len(poses)), count) - 1 + np.concatenate([np.arange(1, n + 1) / n for n in count])
+    joints = np.stack([np.interp(position, np.arange(len(poses)), column) for column in path.joints.T], axis=1)
+    nearest = np.ceil(position - 1e-9).clip(0).astype(int)
+    return Motion(joints, _finger_ramp(closed[nearest], rate_hz), poses[nearest], closed[nearest])
+
+
+def _lead_in(home: FloatArray, first: FloatArray) -> list[FloatArray]:
+    """Poses from ``home`` over to ``first``: at the height of the higher one, then down."""
+    over = first.copy()
+    over[2, 3] = max(home[2, 3], first[2, 3])
+    return [home, over, first]
+
+
+def _smooth(times: FloatArray, knots: FloatArray, at: FloatArray) -> FloatArray:
+    """Poses at times ``at`` through ``knots``, without overshoot (monotone cubic; Fritsch and Carlson 1980)."""
+    poses = np.tile(np.eye(4), (len(at), 1, 1))
+    poses[:, :3, 3] = PchipInterpolator(times, knots[:, :3, 3])(at)
+    poses[:, :3, :3] = Slerp(times, Rotation.from_matrix(knots[:, :3, :3]))(at).as_matrix()
+    return poses
+
+
+def _finger_ramp(closed: np.ndarray, rate_hz: float) -> FloatArray:
+    """Finger travel ``(N,)`` that follows the gripper command no faster than the hand can, from open."""
+    fingers = np.empty(len(closed))
+    travel, most = FINGER_TRAVEL_M, FINGER_SPEED_M_S / rate_hz
+    for step, shut in enumerate(closed):
+        travel += np.clip((0.0 if shut else FINGER_TRAVEL_M) - travel, -most, most)
+        fingers[step] = travel
+    return fingers
+
+
+def _refuse(bad: np.ndarray, what: str, amount: np.ndarray, steps: np.ndarray | None = None) -> None:
+    if bad.any():
+        first = int(np.argmax(bad))
+        step = first if steps is None else int(steps[first])
+        raise UnreachableError(f"step {step} of the trajectory asks for " + what.format(amount[first]))

@@ -1,0 +1,14 @@
+"""Tool poses that experts ask for."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.geometry import FloatArray, make_pose
+
+
+def downward(x: float, y: float, z: float, yaw: float = 0.0) -> FloatArray:
+    """Tool at ``(x, y, z)`` m pointing straight down; at ``yaw`` 0 rad the fingers open along the world's y."""
+    rotation = Rotation.from_euler("z", yaw).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    return make_pose(rotation, (x, y, z))

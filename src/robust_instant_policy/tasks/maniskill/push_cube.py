@@ -1,0 +1,104 @@
+"""Push a cube into a goal disc: the scene and rules of ManiSkill's PushCube-v1, with the UR5e."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils.building import actors
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs.pose import Pose
+
+from robust_instant_policy.tasks.maniskill.cell import CellEnv
+from robust_instant_policy.tasks.maniskill.demonstrator import Stroke
+from robust_instant_policy.tasks.maniskill.poses import downward
+from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
+
+CUBE_HALF_SIZE_M = 0.02
+CUBE_RANGE_M = 0.1  # the cube's x and y lie within ± this
+CUBE_COLOR = (12 / 255, 42 / 255, 160 / 255, 1.0)
+GOAL_RADIUS_M = 0.1
+GOAL_DISTANCE_M = 0.1 + GOAL_RADIUS_M  # from the cube, along +x
+HEIGHT_TOLERANCE_M = 5e-3
+
+FINGER_HALF_WIDTH_M = 0.011
+APPROACH_M = 0.05  # between fingers and cube when the hand comes down behind it
+CLEARANCE_M = 0.1  # height at which the hand travels
+PUSH_HEIGHT_M = 0.015
+OVERSHOOT_M = 0.02  # a person stops within ± this of the middle of the goal
+
+
+@register_env("RIP-PushCube-v1", max_episode_steps=600)
+class PushCubeEnv(CellEnv):
+    """Success: the cube's centre within the goal disc, the cube still on the table."""
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        self.cube = actors.build_cube(
+            self.scene,
+            half_size=CUBE_HALF_SIZE_M,
+            color=np.array(CUBE_COLOR),
+            name="cube",
+            initial_pose=sapien.Pose(p=[0, 0, CUBE_HALF_SIZE_M]),
+        )
+        self.goal = actors.build_red_white_target(
+            self.scene,
+            radius=GOAL_RADIUS_M,
+            thickness=1e-5,
+            name="goal",
+            add_collision=False,
+            body_type="kinematic",
+            initial_pose=sapien.Pose(p=[GOAL_DISTANCE_M, 0, 1e-3]),
+        )
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        super()._initialize_episode(env_idx, options)
+        position = torch.zeros((len(env_idx), 3))
+        position[:, :2] = (2 * torch.rand((len(env_idx), 2)) - 1) * CUBE_RANGE_M
+        position[:, 2] = CUBE_HALF_SIZE_M
+        self.cube.set_pose(Pose.create_from_pq(p=position, q=[1, 0, 0, 0]))
+        position = position + torch.tensor([GOAL_DISTANCE_M, 0.0, 0.0])
+        position[:, 2] = 1e-3
+        self.goal.set_pose(Pose.create_from_pq(p=position, q=[np.sqrt(0.5), 0, np.sqrt(0.5), 0]))
+
+    def evaluate(self) -> dict:
+        offset = self.cube.pose.p[:, :2] - self.goal.pose.p[:, :2]
+        distance = torch.linalg.norm(offset, dim=1)
+        on_table = self.cube.pose.p[:, 2] < CUBE_HALF_SIZE_M + HEIGHT_TOLERANCE_M
+        return {"success": (distance < GOAL_RADIUS_M) & on_table, "distance": distance, "on_table": on_table}
+
+
+def push(env: PushCubeEnv, rng: np.random.Generator) -> list[Stroke]:
+    """Close the hand, come down behind the cube, push it along +x into the goal, and back off."""
+    x, y, _ = env.cube.pose.p[0].tolist()
+    behind = x - CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M - APPROACH_M
+    end = x + GOAL_DISTANCE_M - CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
+    return [
+        Stroke(np.array([downward(behind, y, CLEARANCE_M)]), closed=True, speed=0.35, error=0.004),
+        Stroke(np.array([downward(behind, y, PUSH_HEIGHT_M)]), closed=True, speed=0.15),
+        Stroke(np.array([downward(end, y, PUSH_HEIGHT_M)]), closed=True, speed=0.18),
+        Stroke(np.array([downward(end - APPROACH_M, y, CLEARANCE_M)]), closed=True, error=0.006),
+    ]
+
+
+def verdict(env: PushCubeEnv) -> str:
+    """Why the task failed, or nothing."""
+    state: dict[str, Any] = env.evaluate()
+    if not bool(state["on_table"]):
+        return "the cube left the table top"
+    if not bool(state["success"]):
+        missed, allowed = float(state["distance"]) * 1e3, GOAL_RADIUS_M * 1e3
+        return f"the cube stopped {missed:.0f} mm from the goal's centre, {allowed:.0f} mm allowed"
+    return ""
+
+
+SPEC = TaskSpec(
+    name="push-cube",
+    description="push the cube into the goal disc",
+    goal="the cube is in the goal disc",
+    env_id="RIP-PushCube-v1",
+    expert=push,
+    verdict=verdict,
+)

@@ -1,0 +1,117 @@
+"""The UR5e with a Robotiq Hand-E as a ManiSkill agent.
+
+Published figures and their sources stand in ``ur5e_hande.urdf``. The drives are stiff, like the position
+controller of the real arm: they lag the command by about `DRIVE_LAG_S` and give way at the joints' torque limits.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from mani_skill.agents.base_agent import BaseAgent, Keyframe
+from mani_skill.agents.controllers import PDJointPosControllerConfig, PDJointPosMimicControllerConfig, deepcopy_dict
+from mani_skill.agents.registration import register_agent
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.structs.actor import Actor
+from mani_skill.utils.structs.link import Link
+
+from robust_instant_policy.geometry import GripperTriangle
+
+URDF_PATH = Path(__file__).with_name("ur5e_hande.urdf")
+
+ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+FINGER_JOINTS = ("left_finger", "right_finger")
+TOOL_LINK = "tool"
+
+TOOL_LENGTH_M = 0.157  # flange to tool point, with coupling (Hand-E manual)
+STROKE_M = 0.050  # distance between the open fingertips (Hand-E manual)
+FINGER_TRAVEL_M = STROKE_M / 2
+FINGER_SPEED_M_S = 0.075  # half of the closing speed of 150 mm/s (Hand-E manual)
+GRIP_FORCE_N = 60.0  # a gentle setting; the hand can do 130 N (Hand-E manual)
+
+ARM_TORQUE_NM = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # "Max. joint torques", Universal Robots
+DRIVE_LAG_S = 0.02
+ARM_STIFFNESS = (2e4, 2e4, 1e4, 2e3, 2e3, 1e3)  # N m / rad
+FINGER_STIFFNESS = 2e4  # N / m
+FINGER_DAMPING = 4e2  # N s / m
+FINGER_FRICTION = 1.2  # rubber pads on plastic or wood
+
+PALM_TRIANGLE = GripperTriangle(length=TOOL_LENGTH_M, opening=STROKE_M)
+
+
+@register_agent()
+class UR5eHandE(BaseAgent):
+    """``ur5e_hande``: actions are six joint angles (rad) and the travel of each finger (m, 0 closed)."""
+
+    uid = "ur5e_hande"
+    urdf_path = str(URDF_PATH)
+    urdf_config: ClassVar[dict] = dict(
+        _materials=dict(
+            pads=dict(static_friction=FINGER_FRICTION, dynamic_friction=FINGER_FRICTION, restitution=0.0),
+        ),
+        link=dict(
+            left_finger_link=dict(material="pads", patch_radius=0.01, min_patch_radius=0.01),
+            right_finger_link=dict(material="pads", patch_radius=0.01, min_patch_radius=0.01),
+        ),
+    )
+    disable_self_collisions = True
+    keyframes: ClassVar[dict] = dict(
+        rest=Keyframe(
+            pose=None,
+            qpos=np.array([0.0, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0.0, FINGER_TRAVEL_M, FINGER_TRAVEL_M]),
+        )
+    )
+
+    @property
+    def _controller_configs(self):
+        arm = dict(
+            joint_names=list(ARM_JOINTS),
+            stiffness=list(ARM_STIFFNESS),
+            damping=[DRIVE_LAG_S * stiffness for stiffness in ARM_STIFFNESS],
+            force_limit=list(ARM_TORQUE_NM),
+        )
+        hand = PDJointPosMimicControllerConfig(
+            list(FINGER_JOINTS),
+            lower=0.0,
+            upper=FINGER_TRAVEL_M,
+            stiffness=FINGER_STIFFNESS,
+            damping=FINGER_DAMPING,
+            force_limit=GRIP_FORCE_N,
+            normalize_action=False,
+            mimic={"right_finger": {"joint": "left_finger"}},
+        )
+        return deepcopy_dict(
+            dict(
+                pd_joint_pos=dict(
+                    arm=PDJointPosControllerConfig(lower=None, upper=None, normalize_action=False, **arm), hand=hand
+                ),
+                pd_joint_delta_pos=dict(
+                    arm=PDJointPosControllerConfig(lower=-0.05, upper=0.05, use_delta=True, use_target=True, **arm),
+                    hand=hand,
+                ),
+            )
+        )
+
+    def _after_init(self) -> None:
+        links = self.robot.get_links()
+        self.left_finger: Link = sapien_utils.get_obj_by_name(links, "left_finger_link")
+        self.right_finger: Link = sapien_utils.get_obj_by_name(links, "right_finger_link")
+        self.tcp: Link = sapien_utils.get_obj_by_name(links, TOOL_LINK)
+
+    def is_grasping(self, object: Actor | Link, min_force: float = 0.5, max_angle: float = 85.0) -> torch.Tensor:
+        """Whether both fingers press on ``object`` with ``min_force`` N or more, about along the closing direction."""
+        pressed = []
+        for finger, outward in ((self.left_finger, 1.0), (self.right_finger, -1.0)):
+            force = self.scene.get_pairwise_contact_forces(finger, object)
+            direction = outward * finger.pose.to_transformation_matrix()[..., :3, 1]
+            strength = torch.linalg.norm(force, dim=1)
+            along = (force * direction).sum(dim=1)
+            pressed.append((strength >= min_force) & (along >= np.cos(np.deg2rad(max_angle)) * strength))
+        return pressed[0] & pressed[1]
+
+    def is_static(self, threshold: float = 0.2) -> torch.Tensor:
+        """Whether no arm joint moves faster than ``threshold`` rad/s."""
+        return self.robot.get_qvel()[..., : len(ARM_JOINTS)].abs().amax(dim=1) <= threshold

@@ -1,0 +1,124 @@
+"""A simulated environment with a demonstrator, behind the contract of `tasks.task.Task`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import UnreachableError
+from robust_instant_policy.tasks.maniskill.cell import BASE_POSITION_M, HOME_JOINTS, RECORD_HZ, WORKSPACE, CellEnv
+from robust_instant_policy.tasks.maniskill.demonstrator import Stroke, perform
+from robust_instant_policy.tasks.maniskill.kinematics import Kinematics
+from robust_instant_policy.tasks.maniskill.motion import EXECUTE_HZ, Motion, plan_poses, plan_waypoints
+from robust_instant_policy.tasks.maniskill.renderer import require_renderer
+from robust_instant_policy.tasks.maniskill.robot import PALM_TRIANGLE
+from robust_instant_policy.tasks.maniskill.scene_truth import SceneTruth
+from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink
+from robust_instant_policy.trajectory import Trajectory
+
+HAND_STREAM = 1  # the demonstrator's random numbers, apart from the scene's
+SETTLE_STEPS = 27  # half a second at rest before a demonstration is judged
+STEPS_PER_FRAME = 4
+VIDEO_HZ = RECORD_HZ / STEPS_PER_FRAME
+
+Expert = Callable[[Any, np.random.Generator], Sequence[Stroke]]
+Verdict = Callable[[Any], str]
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """What makes a task: its environment, what the person does in it, and why it failed, in words.
+
+    ``expert(env, rng)`` sees the simulator's state, as a person sees the scene; ``verdict(env)`` returns the
+    reason of failure, or nothing after success.
+    """
+
+    name: str
+    description: str
+    goal: str
+    env_id: str
+    expert: Expert
+    verdict: Verdict
+    env_options: tuple[tuple[str, Any], ...] = ()
+
+
+class SimulatedTask:
+    """See `tasks.task.Task`. One scene at a time; scenes are rebuilt only where their objects differ."""
+
+    record_hz = RECORD_HZ
+    execute_hz = EXECUTE_HZ
+    video_hz = VIDEO_HZ
+    workspace = WORKSPACE
+
+    def __init__(self, spec: TaskSpec):
+        require_renderer()
+        self.name, self.description, self.goal = spec.name, spec.description, spec.goal
+        self._spec = spec
+        self._env = gymnasium.make(spec.env_id, obs_mode="none", reward_mode="none", **dict(spec.env_options))
+        self._cell: CellEnv = self._env.unwrapped
+        self._kinematics = Kinematics(BASE_POSITION_M)
+        self._seed: int | None = None
+
+    def reset(self, seed: int) -> Observation:
+        self._env.reset(seed=seed)
+        self._seed = seed
+        return self._cell.photograph()
+
+    def execute(self, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
+        if self._seed is None:
+            raise UnreachableError("there is no scene to execute in; call reset(seed) first")
+        motion = plan_waypoints(trajectory, self._kinematics, HOME_JOINTS, RECORD_HZ)
+        tracking_error = self._play(motion, on_frame)
+        failure = self._spec.verdict(self._cell)
+        return Execution(not failure, failure, len(motion.joints) / RECORD_HZ, tracking_error)
+
+    def demonstrate(self, seed: int, with_images: bool = False) -> Attempt:
+        observation = self.reset(seed)
+        rng = np.random.default_rng([seed, HAND_STREAM])
+        strokes = self._spec.expert(self._cell, rng)
+        home = self._kinematics.tool_pose(HOME_JOINTS)
+        poses, closed = perform(home, strokes, rng, RECORD_HZ)
+        images: list[np.ndarray] = []
+        try:
+            motion = plan_poses(poses, closed, self._kinematics, HOME_JOINTS, RECORD_HZ)
+        except UnreachableError as error:
+            failure = str(error)
+        else:
+            poses, closed = motion.poses, motion.closed
+            self._play(motion, None, images if with_images else None)
+            self._rest(motion)
+            failure = self._spec.verdict(self._cell)
+        trajectory = Trajectory.from_poses(poses, closed.astype(np.float64), PALM_TRIANGLE)
+        demonstration = Demonstration(observation, trajectory, RECORD_HZ, self.name, seed)
+        return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
+
+    def scene_truth(self) -> SceneTruth:
+        """What the camera's pixels show: for measuring perception, never for a policy."""
+        return self._cell.scene_truth()
+
+    def close(self) -> None:
+        self._env.close()
+
+    def _play(self, motion: Motion, on_frame: FrameSink | None, images: list[np.ndarray] | None = None) -> float:
+        """Run the commands; the largest distance between the palm commanded and reached, in metres."""
+        palm = np.array([0.0, 0.0, -PALM_TRIANGLE.length])
+        worst = 0.0
+        for step, (joints, fingers, pose) in enumerate(zip(motion.joints, motion.fingers, motion.poses, strict=True)):
+            if images is not None:
+                images.append(self._cell.photograph().rgb)
+            if on_frame is not None and step % STEPS_PER_FRAME == 0:
+                on_frame(self._cell.video_frame())
+            self._env.step(np.append(joints, fingers))
+            reached = self._cell.tool_pose()
+            missed = (pose[:3, :3] @ palm + pose[:3, 3]) - (reached[:3, :3] @ palm + reached[:3, 3])
+            worst = max(worst, float(np.linalg.norm(missed)))
+        return worst
+
+    def _rest(self, motion: Motion) -> None:
+        for _ in range(SETTLE_STEPS):
+            self._env.step(np.append(motion.joints[-1], motion.fingers[-1]))

@@ -1,0 +1,70 @@
+"""Recording demonstrations: the demonstrator tries scene after scene, and only its successes are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from robust_instant_policy.demonstration import Demonstration
+from robust_instant_policy.errors import RipError
+from robust_instant_policy.tasks.task import Image, Task
+
+MAX_FAILURES_IN_A_ROW = 50  # then the demonstrator cannot do the task at all
+
+Progress = Callable[[int, int, int], None]
+
+
+class DemonstrationWriter(Protocol):
+    """Where demonstrations go; `datasets.DatasetWriter` is one.
+
+    ``last_seed`` is the last seed tried, kept or thrown away, ``discarded`` the number thrown away so far.
+    """
+
+    @property
+    def num_episodes(self) -> int: ...
+
+    @property
+    def last_seed(self) -> int | None: ...
+
+    @property
+    def discarded(self) -> int: ...
+
+    def add(self, demonstration: Demonstration, images: Image | None = None) -> None: ...
+
+    def discard(self, seed: int | None = None) -> None: ...
+
+
+def record(
+    task: Task,
+    writer: DemonstrationWriter,
+    num_episodes: int,
+    seed: int = 0,
+    with_images: bool = False,
+    on_progress: Progress | None = None,
+) -> int:
+    """Record until ``writer`` holds ``num_episodes``, trying the scenes ``seed``, ``seed + 1``, … in turn.
+
+    Goes on behind the last seed that the writer knows, so a recording that was cut off ends up with the same
+    episodes as one that was not. After every attempt ``on_progress`` receives (episodes there, episodes wanted,
+    attempts thrown away). Returns how many attempts were thrown away.
+    """
+    if writer.last_seed is not None:
+        seed = max(seed, writer.last_seed + 1)
+    in_a_row = 0
+    while writer.num_episodes < num_episodes:
+        attempt = task.demonstrate(seed, with_images)
+        if attempt.success:
+            writer.add(attempt.demonstration, attempt.images)
+            in_a_row = 0
+        else:
+            writer.discard(seed)
+            in_a_row += 1
+            if in_a_row == MAX_FAILURES_IN_A_ROW:
+                raise RipError(
+                    f"the demonstrator of {task.name} failed {in_a_row} times in a row, the last time because "
+                    f"{attempt.failure}; this task cannot be recorded"
+                )
+        seed += 1
+        if on_progress is not None:
+            on_progress(writer.num_episodes, num_episodes, writer.discarded)
+    return writer.discarded
