@@ -13,11 +13,10 @@ from robust_instant_policy.evaluation.episodes import Episode, EpisodeTable
 from robust_instant_policy.evaluation.rollout import roll_out
 from robust_instant_policy.evaluation.table import success_table
 from robust_instant_policy.policies import InstantPolicy, make_policy
-from robust_instant_policy.tasks import make_task
+from robust_instant_policy.tasks import FIRST_TEST_SEED, make_task
 from robust_instant_policy.tasks.record import record
 from robust_instant_policy.tasks.task import Task
 
-FIRST_TEST_SEED = 100_000  # scenes of demonstrations have seeds below, scenes of tests from here on
 SEEDS_A_RUN = 1_000  # apart, so that runs with different --seed share no scene
 
 

@@ -1,0 +1,138 @@
+"""Bad input gets one clear line, exit 1 or 2, and loses nothing."""
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from robust_instant_policy import Observation, Plan
+from robust_instant_policy.cli import main
+from robust_instant_policy.datasets import load_demonstrations
+
+
+def refused(arguments: list[str], capsys) -> tuple[int, str]:
+    """Exit status and the one line of a command that must not work."""
+    try:
+        status = main(arguments)
+    except SystemExit as stop:  # argparse: usage and one line
+        status = stop.code
+        return status, capsys.readouterr().err.strip().splitlines()[-1]
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    return status, lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["demo", "--task", "fly"], 2, "push-cube"),
+        (["record", "--task", "fly", "--out", "x"], 2, "push-cube"),
+        (["eval", "--tasks", "fly", "--out", "x"], 2, "push-cube"),
+        (["eval", "--methods", "magic", "--out", "x"], 2, "rip-gauss"),
+        (["demo", "--demos", "0"], 2, "at least once"),
+        (["eval", "--demos", "0", "--out", "x"], 2, "at least 1"),
+        (["demo", "--seed", "-1"], 2, "whole number"),
+        (["plan", "--demos", "absent", "--observation", "absent.npz"], 1, "absent.npz"),
+        (["juggle"], 2, "juggle"),
+    ],
+)
+def test_wrong_usage_is_told_in_one_line(arguments, status, words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, line = refused(arguments, capsys)
+    assert code == status
+    assert words in line
+
+
+def test_a_missing_or_empty_demonstrations_folder_is_told(workbench, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(workbench)
+    (tmp_path / "empty").mkdir()
+    for folder in (tmp_path / "absent", tmp_path / "empty"):
+        code, line = refused(["plan", "--demos", str(folder), "--observation", "observation.npz"], capsys)
+        assert code == 1
+        assert str(folder) in line
+
+
+def test_demonstrations_of_another_task_are_refused(workbench, monkeypatch, capsys):
+    monkeypatch.chdir(workbench)
+    code, line = refused(["demo", "--task", "pick-banana", "--demos", "data/push-cube"], capsys)
+    assert code == 1
+    assert "push-cube" in line
+    assert "pick-banana" in line
+
+
+def test_a_depth_image_of_zeros_is_told(workbench, tmp_path, capsys):
+    seen = Observation.load(workbench / "observation.npz")
+    blind = Observation(seen.rgb, np.zeros_like(seen.depth), seen.intrinsics, seen.camera_pose)
+    blind.save(tmp_path / "blind.npz")
+    code, line = refused(
+        ["plan", "--demos", str(workbench / "data/push-cube"), "--observation", str(tmp_path / "blind.npz")], capsys
+    )
+    assert code == 1
+    assert "depth" in line
+
+
+@pytest.mark.parametrize("content", [None, b"not a model"])
+def test_a_model_file_that_is_missing_or_corrupt_is_told(workbench, tmp_path, capsys, content):
+    path = tmp_path / "model.gguf"
+    if content is not None:
+        path.write_bytes(content)
+    code, line = refused(
+        [
+            "plan", "--demos", str(workbench / "data/push-cube"),
+            "--observation", str(workbench / "observation.npz"), "--llm", f"gguf:{path}",
+        ],
+        capsys,
+    )  # fmt: skip
+    assert code == 1
+    assert str(path) in line
+
+
+def test_no_space_left_is_told_and_what_was_there_stays(workbench, tmp_path, capsys, monkeypatch):
+    import robust_instant_policy.datasets.files as files
+
+    folder = tmp_path / "data"
+    shutil.copytree(workbench / "data/push-cube", folder)
+    before = len(load_demonstrations(folder))
+
+    def full(*_args, **_kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    code, line = refused(["record", "--task", "push-cube", "--episodes", str(before + 1), "--out", str(folder)], capsys)
+    monkeypatch.undo()
+    assert code == 1
+    assert "space" in line
+    assert len(load_demonstrations(folder)) == before
+
+
+def test_ctrl_c_ends_a_recording_in_one_line_and_keeps_finished_episodes(tmp_path):
+    folder = tmp_path / "data"
+    code = "import sys; from robust_instant_policy.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "record", "--task", "push-cube", "--episodes", "500", "--out", str(folder)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not (folder / "meta" / "info.json").exists():
+        assert time.monotonic() < deadline, "no episode was recorded in time"
+        assert process.poll() is None
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "stopped" in error.strip().splitlines()[-1]
+    assert "Traceback" not in error
+    assert len(load_demonstrations(folder)) >= 1
+
+
+def test_a_plan_is_made_from_files_alone(workbench, tmp_path, capsys):
+    out = tmp_path / "plan.json"
+    command = ["plan", "--demos", str(workbench / "data/push-cube")]
+    assert main([*command, "--observation", str(workbench / "observation.npz"), "--out", str(out)]) == 0
+    plan = Plan.load(out)
+    assert len(plan.candidates) == 5
+    assert 20 <= len(plan.trajectory) <= 40
+    assert plan.usage.tokens > 0
+    assert [stage.name for stage in plan.usage.stages] == ["keypoints", "language model", "regression"]
