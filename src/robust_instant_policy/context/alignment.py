@@ -1,0 +1,80 @@
+"""The same moments of several demonstrations, side by side.
+
+A demonstration falls into stretches between gripper changes. Demonstrations that open and close the gripper in
+the same order are aligned stretch by stretch, so that "the last step before the grasp" is the same step in all.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedDemonstrations:
+    """Actions ``(I, T, 10·A)`` of the demonstrations ``kept`` (indices), step t meaning the same in each.
+
+    ``key_steps`` are the first and last step and both sides of every gripper change.
+    """
+
+    actions: FloatArray
+    kept: tuple[int, ...]
+    key_steps: tuple[int, ...]
+
+
+def align(trajectories: Sequence[Trajectory]) -> AlignedDemonstrations:
+    """Bring ``trajectories`` to a common number of steps, the median of each stretch's.
+
+    Demonstrations whose gripper does something else than in more than half of them are left out; if no such
+    majority exists, all are stretched evenly over their whole length.
+    """
+    stretches = [_stretches(trajectory) for trajectory in trajectories]
+    orders = [tuple(state for state, _, _ in parts) for parts in stretches]
+    order, votes = Counter(orders).most_common(1)[0]
+    if 2 * votes <= len(trajectories) and votes < len(trajectories):
+        length = round(float(np.median([len(trajectory) for trajectory in trajectories])))
+        even = [trajectory.resampled(np.linspace(0, 1, length)).actions for trajectory in _from_zero_to_one(trajectories)]
+        return AlignedDemonstrations(np.stack(even), tuple(range(len(trajectories))), (0, length - 1))
+
+    kept = tuple(index for index, own in enumerate(orders) if own == order)
+    lengths = [
+        max(1, round(float(np.median([stretches[index][part][2] - stretches[index][part][1] for index in kept]))))
+        for part in range(len(order))
+    ]
+    actions = np.stack(
+        [
+            np.concatenate(
+                [
+                    _stretched(trajectories[index].actions[start:stop], length)
+                    for (_, start, stop), length in zip(stretches[index], lengths, strict=True)
+                ]
+            )
+            for index in kept
+        ]
+    )
+    starts = np.cumsum([0, *lengths])
+    edges = {0, int(starts[-1]) - 1, *map(int, starts[1:-1]), *(int(start) - 1 for start in starts[1:-1])}
+    return AlignedDemonstrations(actions, kept, tuple(sorted(edges)))
+
+
+def _stretches(trajectory: Trajectory) -> list[tuple[tuple[int, ...], int, int]]:
+    """Runs of equal gripper state: (state of each arm, first step, step after the last)."""
+    states = [tuple(int(value > 0.5) for value in row) for row in trajectory.gripper_state]
+    edges = [0, *(step for step in range(1, len(states)) if states[step] != states[step - 1]), len(states)]
+    return [(states[start], start, stop) for start, stop in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def _stretched(actions: FloatArray, length: int) -> FloatArray:
+    at = np.linspace(0, len(actions) - 1, length) if length > 1 else np.array([len(actions) - 1.0])
+    steps = np.arange(len(actions))
+    return np.stack([np.interp(at, steps, column) for column in actions.T], axis=1)
+
+
+def _from_zero_to_one(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+    return [Trajectory.from_actions(trajectory.actions) for trajectory in trajectories]

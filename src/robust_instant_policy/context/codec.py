@@ -1,0 +1,81 @@
+"""Numbers to text, and text back to numbers without ever guessing one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robust_instant_policy.geometry import FloatArray
+
+MM = 1000.0  # per metre
+
+_MINUS = str.maketrans(dict.fromkeys("−–—‒﹣－", "-"))
+_BRACKETS = str.maketrans(dict.fromkeys("[](){}|", " "))
+_NUMBER = r"[+-]?\d{1,6}(?:\.\d{1,6})?"
+_SPACED = re.compile(rf"{_NUMBER}(?:\s+{_NUMBER})*")
+_COMMAS = re.compile(rf"{_NUMBER}(?:\s*,\s*{_NUMBER})*")
+_LABEL = re.compile(r"^[^:=>]*[:=>]\s*(?=[-+\d\s])")
+_EDGES = " \t,;.`'\"*"
+
+
+def millimetres(metres: ArrayLike) -> np.ndarray:
+    """Whole millimetres."""
+    return np.round(np.asarray(metres, dtype=np.float64) * MM).astype(int)
+
+
+def write_row(numbers: Sequence[int] | np.ndarray) -> str:
+    return " ".join(str(int(number)) for number in numbers)
+
+
+def row_grammar(digits: Sequence[int]) -> str:
+    """GBNF for one line of integers; the j-th has up to ``digits[j]`` digits."""
+    return 'root ::= ' + ' " " '.join(f'"-"? [0-9]{{1,{count}}}' for count in digits) + ' "\\n"'
+
+
+def row_pattern(digits: Sequence[int]) -> str:
+    """The same as a regular expression."""
+    return " ".join(f"-?[0-9]{{1,{count}}}" for count in digits) + r"\n"
+
+
+def read_row(text: str, columns: int) -> FloatArray | None:
+    """The ``columns`` numbers of one line, or None when the line is anything but exactly these.
+
+    Separators are either commas or spaces throughout ("1,5" between spaces might be a decimal comma); brackets, a
+    label before a colon and punctuation at the ends do not matter.
+    """
+    line = text.translate(_MINUS).translate(_BRACKETS).strip(_EDGES)
+    for candidate in (line, _LABEL.sub("", line, count=1).strip(_EDGES)):
+        for form, separator in ((_SPACED, None), (_COMMAS, ",")):
+            if form.fullmatch(candidate):
+                values = [float(part) for part in candidate.split(separator)]
+                if len(values) == columns:
+                    return np.array(values)
+    return None
+
+
+def read_rows(text: str, columns: int) -> FloatArray | None:
+    """The rows ``(N, columns)`` of numbers in an answer, or None when one of them cannot be read for certain.
+
+    Around the rows there may be prose and code fences; the last row may be cut off, and is then left out. A line
+    between two rows that holds numbers but is not a row makes the answer worthless: a step would be missing.
+    """
+    rows: list[FloatArray] = []
+    broken = False
+    for line in _lines(text):
+        row = read_row(line, columns)
+        if row is not None:
+            if broken:
+                return None
+            rows.append(row)
+        elif rows and re.search(r"\d", line):
+            broken = True
+    return np.stack(rows) if rows else None
+
+
+def _lines(text: str) -> list[str]:
+    # A list of lists on one line: each inner list is a row.
+    flat = re.sub(r"\]\s*,?\s*\[", "]\n[", text) if re.search(r"\]\s*,?\s*\[[^\[\]]*[\d\s]+\]", text) else text
+    return [line for line in re.split(r"[\n;]", flat) if line.strip()]

@@ -1,0 +1,177 @@
+"""Frames to write a step's numbers in, and the choice of the one in which the demonstrations agree best.
+
+"Move to 4 cm above the cup" is the same numbers in every demonstration when it is written in the cup's frame, and
+different ones in the world's. Which frame that is changes over a task (first the cup, then the saucer) and is
+found from the demonstrations alone: candidates are the world, each keypoint, and rigid frames fitted to keypoints
+that keep their distances to each other; dynamic programming finds the sequence of frames with the
+smallest spread across demonstrations, paying a price for each change of frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+
+from robust_instant_policy.geometry import FloatArray, fit_rigid, make_pose, transform_points
+
+RIGID_SPREAD_M = 0.010  # keypoints whose distance varies less than this belong to the same object
+OUTLIER_M = 0.006  # a keypoint this far from where the others put it counts half
+SPREAD_FLOOR_M = 0.002  # differences of spread below this mean nothing
+SWITCH_COST = 1.0  # a change of frame must make the spread e times smaller for one step, or sqrt(e) for two
+KEY_STEP_WEIGHT = 3.0  # how much more the start, the end and gripper changes count
+DISTANCE_COST_PER_M = 0.2  # of frames that agree equally, the one nearer to the gripper
+WORLD_DISTANCE_M = 0.5  # the world frame counts as being this far away
+
+MAD_TO_STD = 1.4826
+
+Kind = Literal["world", "keypoint", "upright", "rigid"]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A coordinate system that can be found in any scene from its keypoints ``(K, 3)``.
+
+    ``world`` is the world itself; ``keypoint`` keeps the world's axes with its origin at the keypoint; ``upright``
+    also turns about the vertical with the keypoints ``members``, ``rigid`` in all directions. ``shape (N, 3)`` are the members'
+    places in the frame.
+    """
+
+    kind: Kind
+    members: tuple[int, ...] = ()
+    shape: FloatArray | None = None
+
+    def pose(self, keypoints: FloatArray) -> FloatArray:
+        """The frame's pose ``(4, 4)`` in the scene of ``keypoints (K, 3)``."""
+        if self.kind == "world":
+            return np.eye(4)
+        points = keypoints[list(self.members)]
+        if self.kind == "keypoint":
+            return make_pose(np.eye(3), points[0])
+        assert self.shape is not None
+        return robust_fit(self.shape, points, upright=self.kind == "upright")
+
+    def __str__(self) -> str:
+        if self.kind == "world":
+            return "world"
+        names = " ".join(str(member) for member in self.members)
+        return f"keypoint {names}" if self.kind == "keypoint" else f"{self.kind} on keypoints {names}"
+
+
+WORLD = Frame("world")
+
+
+def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArray:
+    """Pose ``(4, 4)`` that puts ``shape (N, 3)`` onto ``points (N, 3)``, whatever a minority of wrong points says.
+
+    The smallest subsets that fix a pose are tried; the one that most points agree with is refined by
+    reweighted least squares.
+    """
+    size = 2 if upright else 3
+    fit = _fit_upright if upright else fit_rigid
+    if len(shape) > size:
+        subsets = np.array(list(combinations(range(len(shape)), size)))
+        starts = fit(shape[subsets], points[subsets], np.ones(subsets.shape))
+        residuals = np.linalg.norm(_moved(starts, shape) - points, axis=-1)
+        pose = starts[np.argmin((residuals**2 / (residuals**2 + OUTLIER_M**2)).sum(axis=-1))]
+        for _ in range(5):
+            residual = np.linalg.norm(transform_points(pose, shape) - points, axis=-1)
+            pose = fit(shape, points, 1 / (1 + (residual / OUTLIER_M) ** 2) ** 2)
+        return pose
+    return fit(shape, points, np.ones(len(shape)))
+
+
+def _moved(poses: FloatArray, points: FloatArray) -> FloatArray:
+    return points @ np.swapaxes(poses[..., :3, :3], -1, -2) + poses[..., None, :3, 3]
+
+
+def _fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
+    """Weighted least-squares pose that turns about the vertical only; batched like `fit_rigid`."""
+    share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
+    source_mean = (share * source).sum(axis=-2, keepdims=True)
+    target_mean = (share * target).sum(axis=-2, keepdims=True)
+    a, b = source - source_mean, target - target_mean
+    sine = (share[..., 0] * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])).sum(axis=-1)
+    cosine = (share[..., 0] * (a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1])).sum(axis=-1)
+    angle = np.arctan2(sine, cosine)
+    pose = np.zeros((*angle.shape, 4, 4))
+    pose[..., 0, 0] = pose[..., 1, 1] = np.cos(angle)
+    pose[..., 1, 0], pose[..., 0, 1] = np.sin(angle), -np.sin(angle)
+    pose[..., 2, 2] = pose[..., 3, 3] = 1.0
+    pose[..., :3, 3] = target_mean[..., 0, :] - (pose[..., :3, :3] @ np.swapaxes(source_mean, -1, -2))[..., 0]
+    return pose
+
+
+def candidate_frames(keypoints: FloatArray) -> list[Frame]:
+    """Frames worth trying for demonstrations with ``keypoints (I, K, 3)``.
+
+    Keypoints belong together when their distance is nearly the same in most demonstrations. Each keypoint gives a
+    frame of its own, and upright and rigid frames on all that belong with it and on the nearest few of them.
+    """
+    num_demos, num_points = keypoints.shape[:2]
+    frames = [WORLD, *(Frame("keypoint", (k,)) for k in range(num_points))]
+    distances = np.linalg.norm(keypoints[:, :, None] - keypoints[:, None], axis=-1)
+    varies = spread(distances)
+    closeness = np.median(distances, axis=0)
+    groups: dict[tuple[int, ...], None] = {}
+    for k in range(num_points):
+        together = [j for j in range(num_points) if j == k or varies[k, j] < RIGID_SPREAD_M] if num_demos > 2 else range(num_points)
+        near = sorted(together, key=lambda j: closeness[k, j])
+        for size in {2, 3, 5, len(near)}:
+            if 2 <= size <= len(near):
+                groups[tuple(sorted(near[:size]))] = None
+    reference = _most_typical(keypoints)
+    for members in groups:
+        shape = keypoints[reference, list(members)]
+        shape = shape - shape.mean(axis=0)
+        if len(members) >= 2:
+            frames.append(Frame("upright", members, shape))
+        if len(members) >= 3:
+            frames.append(Frame("rigid", members, shape))
+    return frames
+
+
+def spread(values: FloatArray) -> FloatArray:
+    """Robust standard deviation over the first axis (from the median absolute deviation)."""
+    return MAD_TO_STD * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
+
+
+def _most_typical(keypoints: FloatArray) -> int:
+    """The scene whose keypoints are, as a set of distances, nearest to the median scene."""
+    distances = np.linalg.norm(keypoints[:, :, None] - keypoints[:, None], axis=-1)
+    return int(np.argmin(np.abs(distances - np.median(distances, axis=0)).sum(axis=(1, 2))))
+
+
+def choose_frames(
+    frames: Sequence[Frame], poses: FloatArray, points: FloatArray, key_steps: Sequence[int]
+) -> list[int]:
+    """Which of ``frames`` each step is written in.
+
+    ``poses (F, I, 4, 4)`` are the frames in each demonstration's scene, ``points (I, T, P, 3)`` the gripper's points.
+    Minimises the summed log spread of the points in their frames plus a price for each change (Viterbi).
+    """
+    inverse_rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
+    offset = points[None] - poses[:, :, None, None, :3, 3]
+    local = np.einsum("fixy,fitpy->fitpx", inverse_rotation, offset)
+    scatter = np.stack([np.sqrt((spread(values) ** 2).sum(axis=-1).mean(axis=-1)) for values in local])  # (F, T)
+    distance = np.median(np.linalg.norm(offset, axis=-1).min(axis=-1), axis=1)  # (F, T)
+    distance[[frame.kind == "world" for frame in frames]] = WORLD_DISTANCE_M
+    cost = np.log(scatter + SPREAD_FLOOR_M) + DISTANCE_COST_PER_M * distance
+    weight = np.ones(points.shape[1])
+    weight[list(key_steps)] = KEY_STEP_WEIGHT
+    cost = cost * weight
+
+    total = cost[:, 0]
+    origin = np.zeros((len(frames), points.shape[1]), dtype=np.intp)
+    for step in range(1, points.shape[1]):
+        best = int(np.argmin(total))
+        switch = total[best] + SWITCH_COST
+        origin[:, step] = np.where(total <= switch, np.arange(len(frames)), best)
+        total = np.minimum(total, switch) + cost[:, step]
+    chosen = [int(np.argmin(total))]
+    for step in range(points.shape[1] - 1, 0, -1):
+        chosen.append(int(origin[chosen[-1], step]))
+    return chosen[::-1]
