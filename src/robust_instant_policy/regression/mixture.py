@@ -35,7 +35,7 @@ class StudentTMixture:
         self.labels = self._partition(data.at(data.grid()))
         self.num_modes = int(self.labels.max()) + 1
         self.modes = [
-            StudentTRegression(self.dof, self.groups).fit(
+            StudentTRegression(self.dof, groups=self.groups).fit(
                 [rows[q] for q in np.flatnonzero(self.labels == mode)],
                 [clocks[q] for q in np.flatnonzero(self.labels == mode)],
             )

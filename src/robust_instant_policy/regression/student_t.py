@@ -17,25 +17,40 @@ no maximum for Q - 1 < p/ν: it grows without bound as the fit shrinks onto a si
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import gammaln
 
-from robust_instant_policy.errors import InvalidValueError
+from robust_instant_policy.errors import InvalidValueError, UnknownNameError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression.alignment import Candidates, checked_dof
-from robust_instant_policy.regression.basis import HatBasis, Roughness, solve_banded
+from robust_instant_policy.regression.basis import HatBasis, Roughness, multiply_banded, solve_banded
+from robust_instant_policy.regression.switching import persistent
 
 DEFAULT_DOF = 1.5  # the paper's ν
-MAX_ITERATIONS = 100
-TOLERANCE = 1e-5  # of log-likelihood per sample: below this gain an iteration changes nothing that a robot could feel
+UNITS = ("step", "trajectory", "number")
+MAX_ITERATIONS = 200
+TOLERANCE = 1e-6  # log-likelihood gained per number: less in an iteration moves nothing that a robot could feel
+DRAFT_ITERATIONS = 6  # of the fit without smoothing from which outlying stretches are judged,
+REDRAFT_ITERATIONS = 3  # and more without those, from which the smoothing is
 SCALE_FLOOR = 1e-9  # of the data's extent: candidates that agree to the last digit still have a likelihood
-PRIOR_SAMPLES = 2.0  # candidates' worth of trust in the pooled scale, against that of one step alone
-PAIRWISE_LIMIT = 4_000_000  # numbers compared pair by pair to find a start; beyond it, there are enough for a median
+PRIOR_SAMPLES = 2.0  # candidates' worth of trust in the scale of all steps, against that of one step alone
+PAIRWISE_LIMIT = 4_000_000  # numbers compared pair by pair to find a start; beyond it there are enough for a median
+
+STANDS_OUT = 0.7  # -log w of a step from which it speaks against its candidate: about twice the scale
+STRETCH_COST = 1.0  # such evidence needed to begin or end a stretch that is left out
+LEFT_OUT = 1e-3  # weight of a sample in such a stretch; not 0, so that a step where all stand out still has a mean
+
+STIFFNESSES = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0])  # prices on squared acceleration, in 1/σ²
+CORNER_DOF = 2.0  # accelerations are Student-t as well: most steps go straight, some turn sharply and stay sharp
+CORNER_SWEEPS = 2  # reweightings of the accelerations at each stiffness tried
+FAINT = 1e-6  # stiffness that only ties down knots between which no candidate has a sample
+NEARLY_GAUSSIAN_DOF = 30.0  # from here on smoothing fades, so that ν → ∞ is the mean of the candidates
 
 
-def log_density(distance: FloatArray, log_scale: FloatArray, dof: float, shared: int = 1) -> FloatArray:
+def log_density(distance: FloatArray, log_scale: FloatArray, dof: float, shared: int | FloatArray = 1) -> FloatArray:
     """Log of the t-density at mean squared ``distance`` δ² of ``shared`` numbers with one u (Eq. 1 for one number).
 
     ``log_scale`` is the sum of log σ over those numbers; ``dof`` = inf is the Gaussian.
@@ -60,66 +75,53 @@ class StudentTRegression:
     >>> fit.mean(times), fit.scale(times), fit.weights              # (T, D), (T, D), list of (T_q,)
 
     ``dof`` is the paper's ν; ``inf`` is the Gaussian ablation, whose mean is the mean of the candidates.
+    ``unit`` is what is right or wrong together: the numbers of a "step" (whose outlying stretches are then left out
+    whole), those of a whole "trajectory", or every "number" by itself, as in the paper's Eq. 1.
     ``groups (D,)`` are labels of the dimensions that share one scale, such as the coordinates of points, which makes
     the fit independent of the choice of axes; without it each dimension has its own.
 
-    After `fit`: ``knots (K,)``, ``weights``, ``log_likelihood`` (one value an iteration, never falling), ``converged``
-    and ``num_iterations``.
+    After `fit`: ``knots (K,)``; ``weights``, Q arrays ``(T_q,)`` in [0, 1]; ``log_likelihood``, a value an iteration,
+    never falling; ``converged`` and ``num_iterations``; ``stiffness``, the price on accelerations that was chosen.
     """
 
-    def __init__(self, dof: float = DEFAULT_DOF, groups: ArrayLike | None = None):
+    def __init__(self, dof: float = DEFAULT_DOF, unit: str = "step", groups: ArrayLike | None = None):
+        if unit not in UNITS:
+            raise UnknownNameError("unit", unit, UNITS)
         self.dof = checked_dof(dof)
+        self.unit = unit
         self.groups = None if groups is None else np.asarray(groups)
 
     def fit(self, candidates: Sequence[ArrayLike], times: Sequence[ArrayLike] | None = None) -> StudentTRegression:
         """Fit to ``candidates``, each ``(T_q, D)``, at ``times``, each ``(T_q,)`` in [0, 1] (evenly spread if None)."""
         data = Candidates.from_arrays(candidates, times)
-        groups = self._group_matrix(data.num_dimensions)
+        model = _Model(data, self.dof, self.unit, self._group_matrix(data.num_dimensions))
+        state = model.start()
+        if np.isfinite(self.dof):
+            for _ in range(DRAFT_ITERATIONS):
+                state, _ = model.improve(state)
+            if self.unit == "step":
+                model.leave_out_stretches(state)
+                for _ in range(REDRAFT_ITERATIONS):
+                    state, _ = model.improve(state)
+            model.choose_stiffness(state)
+            model.scale_is_free = False
+        state, trace = model.maximise(state)
         self.knots = data.grid()
-        basis = HatBasis(self.knots, data.times)
-        roughness = Roughness(self.knots)
-        smoothing = np.full(roughness.count, 0.0 if basis.on_knots else 1e-6)
-        curve, squared_scale = _start(data, self.knots, groups, self.dof)
-        profile = np.ones(len(self.knots))
-        dimension = data.num_dimensions
-        samples = np.bincount(basis.nearest, minlength=len(self.knots)).astype(float)
-        floor = squared_scale * SCALE_FLOOR
-        trace: list[float] = []
-        self.converged = False
-        for _ in range(MAX_ITERATIONS):
-            squares = (data.values - basis(curve)) ** 2
-            relative = (squares / squared_scale).sum(axis=1)
-            at_samples = profile[basis.nearest]
-            distance = relative / at_samples / dimension
-            log_scale = 0.5 * (dimension * np.log(at_samples) + np.log(squared_scale).sum())
-            prior = PRIOR_SAMPLES * dimension * 0.5 * (np.log(profile) + 1 / profile).sum()
-            trace.append(float(log_density(distance, log_scale, self.dof, dimension).sum() - prior))
-            if len(trace) > 1 and trace[-1] - trace[-2] < TOLERANCE * len(data.values):
-                self.converged = True
-                break
-            weights = expected_precision(distance, self.dof)
-            squared_scale = (groups @ ((weights / at_samples) @ squares)) / len(data.values) + floor
-            relative = (squares / squared_scale).sum(axis=1)
-            shared = np.bincount(basis.nearest, weights * relative, len(self.knots)) / dimension
-            profile = (shared + PRIOR_SAMPLES) / (samples + PRIOR_SAMPLES)
-            precision = weights / profile[basis.nearest]
-            bands = basis.normal_matrix(precision)
-            bands += roughness.matrix(smoothing) if smoothing.any() else 0.0
-            curve = solve_banded(bands, basis.project(precision[:, None] * data.values))
-        self.num_iterations = len(trace)
+        self.stiffness = model.stiffness
         self.log_likelihood = np.array(trace)
-        self.weights = data.split(np.minimum(expected_precision(distance, self.dof), 1.0))
-        self._curve = curve
-        self._scale = np.sqrt(profile[:, None] * squared_scale)
+        self.num_iterations = len(trace)
+        self.converged = self.num_iterations < MAX_ITERATIONS
+        self.weights = data.split(np.minimum(model.weights(state), 1.0))
+        self._state, self._model = state, model
         return self
 
     def mean(self, times: ArrayLike | None = None) -> FloatArray:
         """The robust trajectory μ ``(T, D)`` at ``times (T,)``, by default at the knots (Oh et al. 2025, Eq. 4)."""
-        return self._evaluate(self._curve, times)
+        return self._evaluate(self._state.curve, times)
 
     def scale(self, times: ArrayLike | None = None) -> FloatArray:
         """The scale σ ``(T, D)`` of trustworthy candidates about the mean at ``times (T,)``."""
-        return self._evaluate(self._scale, times)
+        return self._evaluate(np.sqrt(self._state.profile[:, None] * self._state.squared_scale), times)
 
     def _evaluate(self, values: FloatArray, times: ArrayLike | None) -> FloatArray:
         if times is None:
@@ -139,18 +141,173 @@ class StudentTRegression:
         return same / same.sum(axis=1)
 
 
-def _start(data: Candidates, knots: FloatArray, groups: FloatArray, dof: float) -> tuple[FloatArray, FloatArray]:
-    """A first curve ``(K, D)`` near the densest candidates, and a first squared scale ``(D,)``."""
-    blocks = data.at(knots)
-    median = np.median(blocks, axis=0)
-    deviation = np.abs(blocks - median)
-    extent = np.abs(median).max(axis=0) + np.median(deviation, axis=(0, 1)) + 1e-100
-    squared = groups @ np.median(1.5 * np.median(deviation, axis=0), axis=0) ** 2
-    squared = np.maximum(squared, groups @ (SCALE_FLOOR * extent) ** 2)
-    if np.isinf(dof) or blocks.size * len(blocks) > PAIRWISE_LIMIT:
-        return median, squared
-    gaps = ((blocks[:, None] - blocks[None]) ** 2 / squared).mean(axis=-1)
-    support = expected_precision(gaps / 2, dof).sum(axis=1)
-    support -= expected_precision(np.zeros(1), dof) * (len(blocks) > 1)  # not by itself
-    support = support / support.sum(axis=0)
-    return np.einsum("qk,qkd->kd", support, blocks), squared
+@dataclass(frozen=True, eq=False)
+class _State:
+    """What expectation-maximisation improves: the curve ``(K, D)`` and the squared scale, ``(D,)`` times ``(K,)``."""
+
+    curve: FloatArray
+    squared_scale: FloatArray
+    profile: FloatArray
+
+
+class _Model:
+    """The penalised likelihood of one set of candidates."""
+
+    def __init__(self, data: Candidates, dof: float, unit: str, groups: FloatArray):
+        self.data, self.dof, self.unit, self.groups = data, dof, unit, groups
+        self.basis = HatBasis(data)
+        self.roughness = Roughness(self.basis.knots)
+        self.trust = np.ones(len(data.values))
+        self.stiffness = 0.0
+        self.scale_is_free = True
+        self._count_trust()
+
+    def _count_trust(self) -> None:
+        self._total = self.trust.sum()
+        self._per_knot = self.basis.gather(self.trust)
+
+    def start(self) -> _State:
+        """A curve near the densest candidates, and a scale from what half of them agree on."""
+        blocks = self.data.at(self.basis.knots)
+        median = np.median(blocks, axis=0)
+        deviation = np.median(np.abs(blocks - median), axis=0)
+        extent = np.median(np.abs(median), axis=0) + np.median(deviation, axis=0) + 1e-100
+        self._floor = self.groups @ (SCALE_FLOOR * extent) ** 2
+        squared = self.groups @ np.median(1.5 * deviation, axis=0) ** 2 + self._floor
+        curve = median
+        if np.isfinite(self.dof) and blocks.size * len(blocks) < PAIRWISE_LIMIT and len(blocks) > 1:
+            gaps = ((blocks[:, None] - blocks[None]) ** 2 @ (1 / squared)) / len(squared)
+            # the diagonal is taken out: a candidate does not support itself
+            support = expected_precision(gaps / 2, self.dof).sum(axis=1) - (self.dof + 1) / self.dof
+            curve = np.einsum("qk,qkd->kd", support / support.sum(axis=0), blocks)
+        return _State(curve, squared, np.ones(len(self.basis.knots)))
+
+    def weights(self, state: _State) -> FloatArray:
+        """E-step: expected precision ``(N,)`` of every sample, times the trust in it."""
+        return self.trust * expected_precision(self._distance(self._squares(state), state), self.dof)
+
+    def _squares(self, state: _State) -> FloatArray:
+        residuals = self.basis.residuals(self.data.values, state.curve)
+        return np.multiply(residuals, residuals, out=residuals)
+
+    def _distance(self, squares: FloatArray, state: _State) -> FloatArray:
+        """Mean squared distance δ² ``(N,)`` over the numbers that share one u."""
+        distance = squares @ (1 / (state.squared_scale * len(state.squared_scale)))
+        distance /= self.basis.spread(state.profile)
+        if self.unit == "trajectory":
+            lengths = self.data.lengths
+            distance = np.repeat(np.add.reduceat(distance, self.data.starts[:-1]) / lengths, lengths)
+        return distance
+
+    def improve(self, state: _State) -> tuple[_State, float]:
+        """One iteration; also the log-likelihood of the ``state`` it began with."""
+        values, basis = self.data.values, self.basis
+        squares = self._squares(state)
+        distance = self._distance(squares, state)
+        acceleration = self._acceleration(state)
+        reached = self._log_likelihood(distance, acceleration, state)
+        weights = self.trust * expected_precision(distance, self.dof)
+        squared_scale = state.squared_scale
+        if self.scale_is_free:
+            spread = (weights / basis.spread(state.profile)) @ squares
+            squared_scale = self.groups @ spread / self._total + self._floor
+        shared = basis.gather(weights * (squares @ (1 / (squared_scale * len(squared_scale)))))
+        profile = (shared + PRIOR_SAMPLES) / (self._per_knot + PRIOR_SAMPLES)
+        precision = weights / basis.spread(profile)
+        bands = basis.normal_matrix(precision) + self._price_matrix(acceleration)
+        curve = solve_banded(bands, basis.project(precision, values))
+        return _State(curve, squared_scale, profile), reached
+
+    def maximise(self, state: _State) -> tuple[_State, list[float]]:
+        """Iterate until nothing is gained; returns the log-likelihood of every iteration."""
+        trace: list[float] = []
+        while len(trace) < MAX_ITERATIONS:
+            improved, reached = self.improve(state)
+            trace.append(reached)
+            if len(trace) > 1 and trace[-1] - trace[-2] < TOLERANCE * self.data.values.size:
+                break
+            state = improved
+        return state, trace
+
+    def leave_out_stretches(self, state: _State) -> None:
+        """Distrust the stretches in which a candidate stands out: a hallucination is no matter of one number.
+
+        Evidence is -log w, so that nothing is left out where ν → ∞ and no sample is doubted.
+        """
+        evidence = -np.log(expected_precision(self._distance(self._squares(state), state), self.dof)) - STANDS_OUT
+        lengths = self.data.lengths
+        steps = np.arange(lengths.max())
+        ragged = np.full((len(self.data), len(steps)), -np.inf)
+        ragged[steps < lengths[:, None]] = evidence
+        out = persistent(ragged, STRETCH_COST)[steps < lengths[:, None]]
+        self.trust = np.where(out, LEFT_OUT, 1.0)
+        self._count_trust()
+
+    def choose_stiffness(self, state: _State) -> None:
+        """Choose the price on accelerations whose curve is expected to lie closest to the truth.
+
+        Smoothing by S moves the unsmoothed curve ȳ, whose error has covariance C; the expected squared error of Sȳ is
+        |Sȳ - ȳ|² + 2 tr(S C) up to a constant (Mallows' Cp). C is measured as the scatter of what each candidate
+        contributes to ȳ, so that errors that wander along a candidate are not taken for detail of the curve.
+        """
+        if len(self.data) < 2 or not self.roughness.count:
+            return
+        unit = np.sqrt(state.squared_scale)
+        normal, pulls = self.pulls(state)
+        pulls = np.asfortranarray((pulls / unit).reshape(len(normal[0]), -1))
+        target = multiply_banded(normal, state.curve)
+        smooth = state
+        best, choice = np.inf, 0.0
+        for stiffness in (0.0, *STIFFNESSES * min(1.0, NEARLY_GAUSSIAN_DOF / self.dof) ** 2):
+            self.stiffness = stiffness
+            for _ in range(CORNER_SWEEPS):
+                bands = normal + self._price_matrix(self._acceleration(smooth))
+                smooth = replace(smooth, curve=solve_banded(bands, target))
+            moved = (smooth.curve - state.curve) / unit
+            risk = (moved * multiply_banded(normal, moved)).sum()
+            risk += 2 * self.inflation * (pulls * solve_banded(bands, pulls)).sum()
+            if risk < best:
+                best, choice = risk, stiffness
+        self.stiffness = choice
+
+    def pulls(self, state: _State) -> tuple[FloatArray, FloatArray]:
+        """Normal matrix ``(3, K)`` of the fit, and how hard each candidate pulls at the curve ``(K, Q, D)``."""
+        precision = self.weights(state) / self.basis.spread(state.profile)
+        residuals = self.basis.residuals(self.data.values, state.curve)
+        return self.basis.normal_matrix(precision), self.basis.project_each(precision, residuals)
+
+    @property
+    def inflation(self) -> float:
+        """Q / (Q - 1): what residuals of a mean of Q candidates lack of their errors."""
+        return len(self.data) / max(len(self.data) - 1, 1)
+
+    def _acceleration(self, state: _State) -> FloatArray:
+        """Mean squared acceleration ``(K-2,)``, in scales."""
+        if not self.roughness.count:
+            return np.zeros(0)
+        return (self.roughness(state.curve) ** 2) @ (1 / (state.squared_scale * len(state.squared_scale)))
+
+    def _price_matrix(self, acceleration: FloatArray) -> FloatArray:
+        if not self.roughness.count:
+            return np.zeros((3, 1))
+        if self.stiffness:
+            return self.roughness.matrix(self.stiffness * expected_precision(self.stiffness * acceleration, CORNER_DOF))
+        return self.roughness.matrix(np.full(self.roughness.count, 0.0 if self.basis.on_knots else FAINT))
+
+    def _log_likelihood(self, distance: FloatArray, acceleration: FloatArray, state: _State) -> float:
+        """Log-likelihood of the candidates plus that of scales and accelerations under their priors."""
+        dimension = len(state.squared_scale)
+        log_profile = np.log(state.profile)
+        if self.unit == "trajectory":
+            lengths, firsts = self.data.lengths, self.data.starts[:-1]
+            total = log_density(distance[firsts], np.zeros(len(lengths)), self.dof, dimension * lengths).sum()
+        else:
+            total = self.trust @ log_density(distance, np.zeros_like(distance), self.dof, dimension)
+        total -= 0.5 * dimension * (self._per_knot @ log_profile)
+        total -= 0.5 * self._total * (np.log(state.squared_scale) + self._floor / state.squared_scale).sum()
+        total -= 0.5 * PRIOR_SAMPLES * dimension * (log_profile + 1 / state.profile).sum()
+        if self.stiffness:
+            total -= 0.5 * dimension * (CORNER_DOF + 1) * np.log1p(self.stiffness * acceleration / CORNER_DOF).sum()
+        elif not self.basis.on_knots:
+            total -= 0.5 * dimension * FAINT * acceleration.sum()
+        return float(total)
