@@ -1,0 +1,69 @@
+"""From another's file to demonstrations, or to a demonstrations folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from robust_instant_policy.datasets import layout
+from robust_instant_policy.datasets.importers.hdf5 import open_hdf5
+from robust_instant_policy.datasets.importers.lerobot import read_lerobot
+from robust_instant_policy.datasets.importers.maniskill import read_maniskill
+from robust_instant_policy.datasets.importers.robomimic import read_robomimic
+from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode
+from robust_instant_policy.datasets.writer import DatasetWriter
+from robust_instant_policy.demonstration import Demonstration
+from robust_instant_policy.errors import DatasetError
+
+
+def import_demonstrations(path: str | Path, task: str, rig: Rig) -> list[Demonstration]:
+    """The successful demonstrations of ``task`` in a ManiSkill, robomimic or LeRobot v3 recording.
+
+    Raises `DatasetError` for another kind of file, and for one that lacks what a demonstration needs; the
+    error lists all of it, and how to supply what can be known.
+    """
+    return [episode.demonstration(task, rig.triangle) for episode in _read_episodes(Path(path), rig)]
+
+
+def convert_demonstrations(path: str | Path, out: str | Path, task: str, description: str, rig: Rig) -> int:
+    """Write what `import_demonstrations` reads into a demonstrations folder, with the images along the way.
+
+    Goes on where an earlier call was interrupted. Returns the number of demonstrations in the folder.
+    Raises `DatasetError` as `import_demonstrations` and `DatasetWriter` do.
+    """
+    writer = None
+    try:
+        for number, episode in enumerate(_read_episodes(Path(path), rig)):
+            demonstration = episode.demonstration(task, rig.triangle)
+            if writer is None:
+                writer = DatasetWriter(out, task, description, demonstration.rate_hz)
+            if number >= writer.num_episodes:
+                writer.add(demonstration, None if episode.images is None else episode.images())
+        return 0 if writer is None else writer.num_episodes
+    finally:
+        if writer is not None:
+            writer.close()
+
+
+def _read_episodes(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
+    for episode in _open(path, rig):
+        yield episode.on(rig)
+
+
+def _open(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
+    if not path.exists():
+        raise DatasetError(f"there is no {path} to import")
+    if path.is_dir():
+        if (path / layout.INFO_PATH).exists():
+            return read_lerobot(path, rig.camera, rig.depth_key, rig.depth_unit_m)
+    else:
+        with open_hdf5(path) as file:
+            names = set(file)
+        if path.with_suffix(".json").exists() and any(name.startswith("traj_") for name in names):
+            return read_maniskill(path, rig.camera)
+        if "data" in names:
+            return read_robomimic(path, rig.camera)
+    raise DatasetError(
+        f"{path} is none of the recordings that can be imported: a ManiSkill trajectory (NAME.h5 beside NAME.json), "
+        "a robomimic HDF5 file, a LeRobot v3 folder"
+    )

@@ -1,0 +1,133 @@
+"""LeRobot v3 datasets whose frames carry end-effector poses.
+
+The format has no place for the camera's intrinsics and pose, for the unit of depth or for what gripper values mean,
+so these come from the user. A pose is three axes x, y, z and either wx, wy, wz (a rotation vector, as lerobot's own
+kinematics write it: ``ee.x … ee.wz, ee.gripper_pos``) or qx, qy, qz, qw, whatever stands before them.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.datasets import layout
+from robust_instant_policy.datasets.folder import Folder, open_folder
+from robust_instant_policy.datasets.importers.hdf5 import choose_camera
+from robust_instant_policy.datasets.importers.source import SourceEpisode
+from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.geometry import FloatArray
+
+AXIS = re.compile(r"(?:.*[._ ])?(x|y|z|wx|wy|wz|qx|qy|qz|qw)$")
+POSITION, ROTATION_VECTOR, QUATERNION = ("x", "y", "z"), ("wx", "wy", "wz"), ("qx", "qy", "qz", "qw")
+POSE_FEATURES = (
+    layout.STATE_KEY,
+    layout.ACTION_KEY,
+)  # where poses are looked for, what was reached before what was asked
+ADVICE = (
+    "A LeRobot dataset names the axes of a pose ee.x, ee.y, ee.z and ee.wx, ee.wy, ee.wz (rotation vector) or "
+    "ee.qx … ee.qw; depth is a feature with one number a pixel, named by depth_key= with its depth_unit_m="
+)
+
+
+def read_lerobot(
+    path: Path, camera: str | None, depth_key: str | None, depth_unit_m: float | None
+) -> Iterator[SourceEpisode]:
+    """The episodes of a LeRobot v3 dataset."""
+    folder = open_folder(path)
+    if (path / layout.RIP_PATH).exists():
+        raise DatasetError(f"{path} already is a demonstrations folder of rip; read it with load_demonstrations")
+    features = folder.info["features"]
+    cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image") and key != depth_key]
+    chosen = choose_camera(path, cameras, camera)
+    if depth_key is not None and depth_key not in features:
+        raise DatasetError(f"{path} has no feature {depth_key!r}; it has: {', '.join(features)}")
+    if depth_key is not None and depth_unit_m is None:
+        raise DatasetError(f"{path} does not say the unit of {depth_key!r}; give depth_unit_m=, metres a step")
+    for episode in range(len(folder.episodes)):
+        poses, gripper = _poses_and_gripper(folder, episode)
+        depth = None
+        if depth_key is not None and depth_unit_m is not None:
+            first = _first_image(folder, episode, depth_key).astype(np.float32)
+            depth = first.reshape(first.shape[:2]) * np.float32(depth_unit_m)
+        yield SourceEpisode(
+            name=f"{path} (episode {episode})",
+            rgb=None if chosen is None else _first_image(folder, episode, chosen),
+            depth=depth,
+            poses=poses,
+            gripper_values=gripper,
+            rate_hz=folder.rate_hz,
+            images=partial(_all_images, folder, episode, chosen) if chosen in folder.video_keys else None,
+            info={
+                "source": path.name,
+                "episode": episode,
+                "description": "; ".join(folder.episodes[episode].get("tasks", [])),
+            },
+            advice=ADVICE if poses is None or depth is None else "",
+        )
+
+
+def _poses_and_gripper(folder: Folder, episode: int) -> tuple[FloatArray | None, FloatArray | None]:
+    poses = gripper = None
+    for key in POSE_FEATURES:
+        if key not in folder.info["features"]:
+            continue
+        names = _axis_names(folder.info["features"][key])
+        axes = _pose_axes(names)
+        grippers = [column for column, name in enumerate(names) if "gripper" in name.lower()]
+        values = np.array(folder.columns(episode, [key])[key].to_pylist(), dtype=np.float64)
+        if poses is None and axes is not None:
+            poses = np.tile(np.eye(4), (len(values), 1, 1))
+            poses[:, :3, 3] = values[:, axes[:3]]
+            turn = Rotation.from_rotvec if len(axes) == 6 else Rotation.from_quat
+            poses[:, :3, :3] = turn(values[:, axes[3:]]).as_matrix()
+        if gripper is None and len(grippers) == 1:
+            gripper = values[:, grippers[0]]
+    return poses, gripper
+
+
+def _axis_names(feature: Mapping[str, Any]) -> list[str]:
+    """Names of a vector's axes; datasets write a list, or lists by the kind of motor."""
+    names = feature.get("names") or []
+    if isinstance(names, Mapping):
+        names = [name for group in names.values() if isinstance(group, list) for name in group]
+    return [str(name) for name in names]
+
+
+def _pose_axes(names: Sequence[str]) -> list[int] | None:
+    """Columns of x, y, z and the rotation; None where there is no pose, or more than one."""
+    columns: dict[str, list[int]] = {}
+    for column, name in enumerate(names):
+        match = AXIS.match(name)
+        if match:
+            columns.setdefault(match[1], []).append(column)
+    for rotation in (ROTATION_VECTOR, QUATERNION):
+        if all(len(columns.get(axis, [])) == 1 for axis in (*POSITION, *rotation)):
+            return [columns[axis][0] for axis in (*POSITION, *rotation)]
+    return None
+
+
+def _all_images(folder: Folder, episode: int, key: str) -> NDArray[np.uint8]:
+    return np.stack(list(folder.frames(episode, key)))
+
+
+def _first_image(folder: Folder, episode: int, key: str) -> NDArray:
+    """The first frame of an image feature: from a video, from stored image files, or from numbers."""
+    if key in folder.video_keys:
+        return next(folder.frames(episode, key))
+    value = folder.columns(episode, [key])[key][0].as_py()
+    if not isinstance(value, Mapping):
+        return np.array(value)
+    try:
+        with Image.open(io.BytesIO(value["bytes"])) as image:
+            return np.asarray(image)
+    except (OSError, TypeError, KeyError, SyntaxError) as error:
+        raise DatasetError(f"{folder.root}: episode {episode} has no readable image {key!r}") from error

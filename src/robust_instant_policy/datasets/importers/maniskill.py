@@ -1,0 +1,89 @@
+"""ManiSkill's trajectory files: ``NAME.h5`` beside ``NAME.json``, as its ``RecordEpisode`` wrapper writes them.
+
+Each ``traj_i`` holds T actions and, where observations were recorded, T + 1 of them: ``obs/extra/tcp_pose``
+(position and quaternion w, x, y, z), ``obs/sensor_data/CAMERA/{rgb, depth}`` (depth int16 millimetres, 0 = no
+reading) and ``obs/sensor_param/CAMERA/{intrinsic_cv, extrinsic_cv}`` (world to camera, OpenCV axes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.datasets.folder import read_json
+from robust_instant_policy.datasets.importers.hdf5 import choose_camera, open_hdf5, read
+from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode
+from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.geometry import FloatArray, invert_pose
+
+MILLIMETRE = 1e-3
+# ManiSkill's Panda: the last action runs from -1 (closed) to 1 (open), and its tcp is the tool frame of `geometry`.
+PANDAS = ("panda", "panda_wristcam")
+PANDA_GRIPPER = GripperCommand(open=1.0, closed=-1.0)
+ADVICE = (
+    "Replay the file with: python -m mani_skill.trajectory.replay_trajectory --traj-path {path} --obs-mode rgbd "
+    "--save-traj --use-env-states"
+)
+
+
+def read_maniskill(path: Path, camera: str | None) -> Iterator[SourceEpisode]:
+    """The successful episodes of a trajectory file. Raises `DatasetError` when there are none."""
+    description = read_json(path.with_suffix(".json"))
+    kwargs = description.get("env_info", {}).get("env_kwargs", {})
+    episodes = description.get("episodes", [])
+    successful = [episode for episode in episodes if episode.get("success", True)]
+    if not successful:
+        raise DatasetError(f"{path} holds {len(episodes)} episodes, none of them successful")
+    with open_hdf5(path) as file:
+        for episode in successful:
+            name = f"traj_{episode['episode_id']}"
+            if name not in file:
+                raise DatasetError(f"{path} has no {name}, which its .json lists")
+            yield _read_episode(path, name, file[name], camera, episode, kwargs)
+
+
+def _read_episode(
+    path: Path, name: str, group: Any, camera: str | None, episode: Mapping[str, Any], kwargs: Mapping[str, Any]
+) -> SourceEpisode:
+    cameras = list(group["obs/sensor_data"]) if "obs/sensor_data" in group else []
+    chosen = choose_camera(path, cameras, camera)
+    images, depth = (read(group, f"obs/sensor_data/{chosen}/{kind}") for kind in ("rgb", "depth"))
+    intrinsics = read(group, f"obs/sensor_param/{chosen}/intrinsic_cv")
+    extrinsics = read(group, f"obs/sensor_param/{chosen}/extrinsic_cv")
+    tcp = read(group, "obs/extra/tcp_pose")
+    actions = read(group, "actions")
+    panda = _robots(group, kwargs) & set(PANDAS)
+    return SourceEpisode(
+        name=f"{path.name} ({name})",
+        rgb=None if images is None else images[0],
+        depth=None if depth is None else depth[0, ..., 0].astype(np.float32) * MILLIMETRE,
+        intrinsics=None if intrinsics is None else intrinsics[0].astype(np.float64),
+        camera_pose=None if extrinsics is None else invert_pose(np.vstack([extrinsics[0], [0, 0, 0, 1]])),
+        poses=None if tcp is None else _poses(tcp),
+        tool=np.eye(4) if panda else None,
+        # The command given at an observation; none is given at the last one, so the one before holds.
+        gripper_values=None if actions is None else np.append(actions[:, -1], actions[-1, -1]).astype(np.float64),
+        gripper=PANDA_GRIPPER if panda else None,
+        rate_hz=kwargs.get("sim_config", {}).get("control_freq"),
+        images=None if images is None else lambda: images,
+        info={"source": path.name, "episode": name, "source_seed": str(episode.get("episode_seed"))},
+        advice=ADVICE.format(path=path) if tcp is None or depth is None else "",
+    )
+
+
+def _robots(group: Any, kwargs: Mapping[str, Any]) -> set[str]:
+    """Names of the robot: what the environment was made with, or the articulations that moved in it."""
+    if "robot_uids" in kwargs:
+        return {str(kwargs["robot_uids"])}
+    return set(group["env_states/articulations"]) if "env_states/articulations" in group else set()
+
+
+def _poses(tcp: FloatArray) -> FloatArray:
+    poses = np.tile(np.eye(4), (len(tcp), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(tcp[:, [4, 5, 6, 3]]).as_matrix()
+    poses[:, :3, 3] = tcp[:, :3]
+    return poses

@@ -1,0 +1,80 @@
+"""robomimic's HDF5 files (``docs/datasets/overview.md`` of robomimic), with observations extracted from robosuite.
+
+Each ``data/demo_i`` holds ``actions (T, A)``, ``obs/robot0_eef_pos`` and ``obs/robot0_eef_quat`` (x, y, z, w),
+``obs/CAMERA_image`` and, when extracted with ``--depth``, ``obs/CAMERA_depth`` (metres); its attribute
+``camera_info`` gives each camera's intrinsics and its pose in the world, OpenCV axes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.datasets.importers.hdf5 import choose_camera, open_hdf5, read
+from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode
+from robust_instant_policy.errors import DatasetError
+
+ROBOSUITE = 1  # env_type of robosuite
+ROBOSUITE_GRIPPER = GripperCommand(open=-1.0, closed=1.0)  # the same for all of robosuite's grippers
+TOOL_FRAMES = {"Panda": np.eye(4)}  # robots whose right_hand body already is the tool frame of `geometry`
+HAND_CAMERA = "eye_in_hand"  # robomimic writes the pose of these relative to the hand
+ADVICE = (
+    "Extract the observations with: python -m robomimic.scripts.dataset_states_to_obs --dataset {path} "
+    "--output_name depth.hdf5 --camera_names agentview --camera_height 240 --camera_width 320 --depth"
+)
+
+
+def read_robomimic(path: Path, camera: str | None) -> Iterator[SourceEpisode]:
+    """The episodes of a robomimic file, in the order of their numbers."""
+    with open_hdf5(path) as file:
+        data = file["data"]
+        try:
+            environment = json.loads(data.attrs.get("env_args", "{}"))
+        except ValueError as error:
+            raise DatasetError(f"{path}: the attribute env_args of data is not JSON") from error
+        names = sorted((name for name in data if name.startswith("demo_")), key=lambda name: int(name[5:]))
+        if not names:
+            raise DatasetError(f"{path} holds no demonstrations")
+        for name in names:
+            yield _read_episode(path, name, data[name], camera, environment)
+
+
+def _read_episode(
+    path: Path, name: str, group: Any, camera: str | None, environment: Mapping[str, Any]
+) -> SourceEpisode:
+    observations = group.get("obs", {})
+    cameras = [key.removesuffix("_image") for key in observations if key.endswith("_image")]
+    chosen = choose_camera(path, [one for one in cameras if HAND_CAMERA not in one], camera)
+    images, depth = (read(observations, f"{chosen}_{kind}") for kind in ("image", "depth"))
+    calibration = json.loads(group.attrs.get("camera_info", "{}")).get(chosen, {})
+    position, quaternion = (read(observations, f"robot0_eef_{kind}") for kind in ("pos", "quat"))
+    actions = read(group, "actions")
+    poses = None
+    if position is not None and quaternion is not None:
+        poses = np.tile(np.eye(4), (len(position), 1, 1))
+        poses[:, :3, :3] = Rotation.from_quat(quaternion).as_matrix()
+        poses[:, :3, 3] = position
+    from_robosuite = environment.get("env_type") == ROBOSUITE
+    settings = environment.get("env_kwargs", {})
+    robots = settings.get("robots", "")
+    robot = robots[0] if isinstance(robots, list) and len(robots) == 1 else robots
+    return SourceEpisode(
+        name=f"{path.name} ({name})",
+        rgb=None if images is None else images[0],
+        depth=None if depth is None else depth[0].reshape(depth.shape[1:3]).astype(np.float32),
+        intrinsics=np.array(calibration["intrinsics"], dtype=np.float64) if "intrinsics" in calibration else None,
+        camera_pose=np.array(calibration["extrinsics"], dtype=np.float64) if "extrinsics" in calibration else None,
+        poses=poses,
+        tool=TOOL_FRAMES.get(robot) if from_robosuite and isinstance(robot, str) else None,
+        gripper_values=None if actions is None else actions[:, -1].astype(np.float64),
+        gripper=ROBOSUITE_GRIPPER if from_robosuite else None,
+        rate_hz=settings.get("control_freq"),
+        images=None if images is None else lambda: images,
+        info={"source": path.name, "episode": name, "environment": str(environment.get("env_name", ""))},
+        advice=ADVICE.format(path=path) if depth is None or poses is None or not calibration else "",
+    )

@@ -1,0 +1,125 @@
+"""An episode as another format holds it, and how it becomes a demonstration or a list of what it lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.geometry import FloatArray, GripperTriangle
+from robust_instant_policy.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class GripperCommand:
+    """What a recorded gripper value means: ``open`` and ``closed`` are the values of either."""
+
+    open: float
+    closed: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.open, self.closed]).all() and self.open != self.closed):
+            raise InvalidValueError(f"open and closed must be two different numbers, got {self.open} and {self.closed}")
+
+    def state(self, values: ArrayLike) -> FloatArray:
+        """Gripper state of ``values (T,)``: 0 nearer to open, 1 nearer to closed."""
+        values = np.asarray(values, dtype=np.float64)
+        return (np.abs(values - self.closed) < np.abs(values - self.open)).astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """The robot and the camera that a file was recorded with, as far as the user knows and the file does not say.
+
+    ``triangle`` stands for the gripper in the imported trajectories, so it is the choice of whoever plays them
+    back. ``camera`` names the camera whose image and depth show the start. ``intrinsics (3, 3)``,
+    ``camera_pose (4, 4)`` camera to world, OpenCV axes; ``tool (4, 4)`` the tool frame of `geometry` within the
+    recorded end-effector frame; ``gripper`` what the last action, or the gripper's position, means; ``rate_hz`` the
+    rate of the frames. For LeRobot datasets, ``depth_key`` is the feature with the depth and ``depth_unit_m`` the
+    metres of one of its steps.
+    """
+
+    triangle: GripperTriangle
+    camera: str | None = None
+    intrinsics: FloatArray | None = None
+    camera_pose: FloatArray | None = None
+    tool: FloatArray | None = None
+    gripper: GripperCommand | None = None
+    rate_hz: float | None = None
+    depth_key: str | None = None
+    depth_unit_m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SourceEpisode:
+    """What a file says about one episode; None for what it does not say.
+
+    ``rgb``, ``depth`` (metres), ``intrinsics``, ``camera_pose`` as in `Observation`; ``poses (T, 4, 4)`` of the
+    end effector in the world; ``tool (4, 4)``, the tool frame of `geometry` within the end effector's own;
+    ``gripper_values (T,)`` and what they mean. ``images`` gives ``(T, H, W, 3)`` uint8 along the way.
+    ``advice`` says how such a file comes to hold what it lacks.
+    """
+
+    name: str
+    rgb: NDArray[np.uint8] | None = None
+    depth: NDArray[np.float32] | None = None
+    intrinsics: FloatArray | None = None
+    camera_pose: FloatArray | None = None
+    poses: FloatArray | None = None
+    tool: FloatArray | None = None
+    gripper_values: FloatArray | None = None
+    gripper: GripperCommand | None = None
+    rate_hz: float | None = None
+    images: Callable[[], NDArray[np.uint8]] | None = None
+    info: Mapping[str, str | float | int] = field(default_factory=dict)
+    advice: str = ""
+
+    def on(self, rig: Rig) -> SourceEpisode:
+        """The episode with what is known of its rig; that outweighs what the file says."""
+        names = ("intrinsics", "camera_pose", "tool", "gripper", "rate_hz")
+        known = {name: getattr(rig, name) for name in names if getattr(rig, name) is not None}
+        return replace(self, **known)
+
+    def demonstration(self, task: str, triangle: GripperTriangle) -> Demonstration:
+        """Raises `DatasetError` that lists everything a demonstration needs and this episode lacks."""
+        if (
+            self.poses is None
+            or self.gripper_values is None
+            or self.rgb is None
+            or self.depth is None
+            or self.intrinsics is None
+            or self.camera_pose is None
+            or self.tool is None
+            or self.gripper is None
+            or self.rate_hz is None
+        ):
+            raise DatasetError(f"{self.name} lacks {'; '.join(self._missing())}{self.advice and '. ' + self.advice}")
+        try:
+            trajectory = Trajectory.from_poses(
+                self.poses @ self.tool, self.gripper.state(self.gripper_values), triangle
+            )
+            observation = Observation(self.rgb, self.depth, self.intrinsics, self.camera_pose)
+        except InvalidValueError as error:
+            raise DatasetError(f"{self.name}: {error}") from error
+        return Demonstration(observation, trajectory, self.rate_hz, task, info=self.info)
+
+    def _missing(self) -> list[str]:
+        values = self.gripper_values
+        span = "" if values is None else f", which lie between {values.min():g} and {values.max():g}"
+        needs = {
+            "poses": "end-effector poses",
+            "gripper_values": "the gripper's commands or positions",
+            "rgb": "a colour image of the start",
+            "depth": "a depth image of the start",
+            "intrinsics": "the camera's intrinsics (known? Rig(intrinsics=), 3 x 3)",
+            "camera_pose": "the camera's pose in the world (known? Rig(camera_pose=), 4 x 4, OpenCV axes)",
+            "tool": "the tool frame within the end effector's (known? Rig(tool=), 4 x 4: z out of the gripper, "
+            "y along the line on which the fingers open, origin between the fingertips)",
+            "gripper": f"the meaning of its gripper values{span} (known? Rig(gripper=GripperCommand(open=, closed=)))",
+            "rate_hz": "the recording rate (known? Rig(rate_hz=))",
+        }
+        return [description for name, description in needs.items() if getattr(self, name) is None]

@@ -1,0 +1,325 @@
+"""Recordings of others become demonstrations, and what they lack is said."""
+
+import json
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration, images, observation
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.datasets import DatasetWriter, load_demonstrations, load_frames
+from robust_instant_policy.datasets.importers import (
+    GripperCommand,
+    Rig,
+    convert_demonstrations,
+    import_demonstrations,
+)
+from robust_instant_policy.datasets.video import encode_video
+from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.geometry import GripperTriangle, lift, make_pose, project
+
+TRIANGLE = GripperTriangle(length=0.1, opening=0.08)
+TOOL = np.eye(4)
+
+
+def refusal(action, *arguments):
+    with pytest.raises(DatasetError) as caught:
+        action(*arguments)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+# ---- ManiSkill: a real environment, recorded by ManiSkill's own wrapper
+
+
+@pytest.fixture(scope="module")
+def maniskill(tmp_path_factory):
+    """A trajectory file of ManiSkill's PushCube with a Panda, and what the simulator itself knew."""
+    gym = pytest.importorskip("gymnasium")
+    pytest.importorskip("mani_skill.envs")
+    from mani_skill.utils.wrappers.record import RecordEpisode
+
+    folder = tmp_path_factory.mktemp("maniskill")
+    environment = RecordEpisode(
+        gym.make(
+            "PushCube-v1",
+            obs_mode="rgbd",
+            control_mode="pd_ee_delta_pose",
+            sim_backend="physx_cpu",
+            render_backend="cpu",
+            sensor_configs={"width": 64, "height": 48},
+        ),
+        str(folder),
+        save_video=False,
+        trajectory_name="trajectory",
+    )
+    inner = environment.unwrapped
+    truth = []
+    for seed in (3, 4, 5):
+        environment.reset(seed=seed)
+        fingers = inner.agent.finger1_link.pose.p[0] - inner.agent.finger2_link.pose.p[0]
+        truth.append({"tips": fingers.numpy(), "cube": inner.obj.pose.p[0].numpy(), "tcp": []})
+        for step in range(6):
+            truth[-1]["tcp"].append(inner.agent.tcp.pose.to_transformation_matrix()[0].numpy())
+            environment.step(np.array([0.3, 0.1, -0.2, 0.1, 0.2, 0.3, 1.0 if step < 4 else -1.0]))
+        truth[-1]["tcp"].append(inner.agent.tcp.pose.to_transformation_matrix()[0].numpy())
+    environment.close()
+    # Such short motions solve nothing; let the first and the last one count as successes.
+    file = folder / "trajectory.json"
+    described = json.loads(file.read_text())
+    for episode in described["episodes"]:
+        episode["success"] = episode["episode_id"] != 1
+    file.write_text(json.dumps(described))
+    return folder / "trajectory.h5", [truth[0], truth[2]]
+
+
+def test_maniskill_trajectories_become_demonstrations(maniskill):
+    path, truth = maniskill
+    demos = import_demonstrations(path, TASK, Rig(TRIANGLE, rate_hz=20.0))
+    assert len(demos) == 2  # the failed one is not a demonstration
+    for demo, known in zip(demos, truth, strict=True):
+        poses = TRIANGLE.poses(demo.trajectory.triplets[:, 0])
+        np.testing.assert_allclose(poses, known["tcp"], atol=1e-4)
+        np.testing.assert_array_equal(demo.trajectory.gripper_state[:, 0], [0, 0, 0, 0, 1, 1, 1])
+        # The fingers open along the tool frame's y, as the triangle takes it.
+        tips = known["tips"] / np.linalg.norm(known["tips"])
+        assert abs(tips @ poses[0, :3, 1]) > 0.999
+        assert (demo.rate_hz, demo.task) == (20.0, TASK)
+
+
+def test_maniskill_depth_and_camera_show_the_cube_where_it_is(maniskill):
+    path, truth = maniskill
+    for demo, known in zip(import_demonstrations(path, TASK, Rig(TRIANGLE, rate_hz=20.0)), truth, strict=True):
+        seen = demo.observation
+        pixel = project(known["cube"], seen.intrinsics, seen.camera_pose)
+        column, row = np.round(pixel).astype(int)
+        point = lift(pixel, seen.depth[row, column], seen.intrinsics, seen.camera_pose)
+        assert np.linalg.norm(point - known["cube"]) < 0.04  # the cube is 4 cm wide, and its surface is seen
+
+
+def test_maniskill_files_convert_to_a_folder_with_images_along_the_way(maniskill, tmp_path):
+    path, _ = maniskill
+    for _ in range(2):  # the second call finds everything there
+        assert convert_demonstrations(path, tmp_path / "out", TASK, DESCRIPTION, Rig(TRIANGLE, rate_hz=20.0)) == 2
+    demos = load_demonstrations(tmp_path / "out", task=TASK)
+    assert [demo.info["source_seed"] for demo in demos] == ["3", "5"]
+    assert len(list(load_frames(tmp_path / "out", 1))) == len(demos[1].trajectory)
+
+
+def test_what_a_maniskill_file_lacks_is_said(maniskill, tmp_path):
+    path, _ = maniskill
+    message = refusal(import_demonstrations, path, TASK, Rig(TRIANGLE))
+    assert "recording rate" in message
+    assert "depth" not in message
+    bare = tmp_path / "bare.h5"
+    with h5py.File(path) as whole, h5py.File(bare, "w") as file:
+        file.create_dataset("traj_0/actions", data=whole["traj_0/actions"])
+        file.create_group("traj_2")
+    bare.with_suffix(".json").write_text(path.with_suffix(".json").read_text())
+    message = refusal(import_demonstrations, bare, TASK, Rig(TRIANGLE))
+    for lacking in ("poses", "depth", "colour", "intrinsics", "tool frame", "between -1 and 1", "replay_trajectory"):
+        assert lacking in message
+    assert "no camera 'top'" in refusal(import_demonstrations, path, TASK, Rig(TRIANGLE, camera="top"))
+
+
+def test_a_maniskill_file_without_a_success_is_refused(maniskill, tmp_path):
+    path, _ = maniskill
+    copy = tmp_path / "failed.h5"
+    copy.write_bytes(path.read_bytes())
+    described = json.loads(path.with_suffix(".json").read_text())
+    for episode in described["episodes"]:
+        episode["success"] = False
+    copy.with_suffix(".json").write_text(json.dumps(described))
+    assert "none of them successful" in refusal(import_demonstrations, copy, TASK, Rig(TRIANGLE, rate_hz=20.0))
+
+
+# ---- robomimic: its documented structure
+
+
+def robomimic_file(path, depth=True, robot="Panda", calibrated=True):
+    environment = {
+        "env_name": "Lift",
+        "env_type": 1,
+        "env_kwargs": {"robots": [robot], "control_freq": 20, "camera_depths": depth},
+    }
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["env_args"] = json.dumps(environment)
+        for seed in (0, 1, 10, 2):
+            demo, seen = demonstration(seed, steps=20), observation(seed)
+            poses = demonstration_poses(demo)
+            group = data.create_group(f"demo_{seed}")
+            group.attrs["num_samples"] = 20
+            group["actions"] = np.column_stack([np.zeros((20, 6)), 2 * demo.trajectory.gripper_state[:, 0] - 1])
+            group["obs/robot0_eef_pos"] = poses[:, :3, 3]
+            group["obs/robot0_eef_quat"] = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+            group["obs/agentview_image"] = np.tile(seen.rgb, (20, 1, 1, 1))
+            group["obs/robot0_eye_in_hand_image"] = np.zeros((20, 8, 8, 3), np.uint8)
+            if depth:
+                group["obs/agentview_depth"] = np.tile(seen.depth[..., None], (20, 1, 1, 1))
+            if calibrated:
+                camera = {"intrinsics": seen.intrinsics.tolist(), "extrinsics": seen.camera_pose.tolist()}
+                group.attrs["camera_info"] = json.dumps({"agentview": camera})
+    return path
+
+
+def demonstration_poses(demo):
+    return TRIANGLE.poses(demo.trajectory.triplets[:, 0])
+
+
+def test_robomimic_files_become_demonstrations(tmp_path):
+    demos = import_demonstrations(robomimic_file(tmp_path / "lift.hdf5"), TASK, Rig(TRIANGLE))
+    assert [demo.info["episode"] for demo in demos] == ["demo_0", "demo_1", "demo_2", "demo_10"]
+    for seed, demo in zip((0, 1, 2, 10), demos, strict=True):
+        original = demonstration(seed, steps=20)
+        np.testing.assert_allclose(demo.trajectory.actions, original.trajectory.actions, atol=1e-9)
+        np.testing.assert_array_equal(demo.observation.rgb, original.observation.rgb)
+        np.testing.assert_array_equal(demo.observation.depth, original.observation.depth)
+        np.testing.assert_array_equal(demo.observation.camera_pose, original.observation.camera_pose)
+        assert demo.rate_hz == 20.0
+
+
+def test_what_a_robomimic_file_lacks_is_said_and_what_is_known_can_be_given(tmp_path):
+    message = refusal(import_demonstrations, robomimic_file(tmp_path / "flat.hdf5", depth=False), TASK, Rig(TRIANGLE))
+    assert "depth" in message
+    assert "dataset_states_to_obs" in message
+    assert "intrinsics" not in message
+    path = robomimic_file(tmp_path / "sawyer.hdf5", robot="Sawyer", calibrated=False)
+    message = refusal(import_demonstrations, path, TASK, Rig(TRIANGLE))
+    assert "tool frame" in message
+    assert "intrinsics" in message
+    turned = make_pose(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [0, 0, 0.02])
+    seen = observation(0)
+    rig = Rig(TRIANGLE, intrinsics=seen.intrinsics, camera_pose=seen.camera_pose, tool=turned)
+    (first, *_) = import_demonstrations(path, TASK, rig)
+    expected = demonstration_poses(demonstration(0, steps=20)) @ turned
+    np.testing.assert_allclose(demonstration_poses(first), expected, atol=1e-9)
+
+
+# ---- LeRobot: several episodes in one file, as lerobot itself writes them
+
+
+def lerobot_folder(path, names, state_of, depth=True):
+    """Two episodes in one data file and one video; the poses of `demonstration` in ``observation.state``."""
+    lengths = {0: 20, 1: 30}
+    states = [state_of(demonstration(seed, steps=length)) for seed, length in lengths.items()]
+    columns = {
+        "observation.state": pa.array(np.concatenate(states).astype(np.float32).tolist()),
+        "timestamp": np.concatenate([np.arange(length) / RATE_HZ for length in lengths.values()]),
+        "frame_index": np.concatenate([np.arange(length) for length in lengths.values()]),
+        "episode_index": np.repeat([0, 1], list(lengths.values())),
+    }
+    features = {
+        "observation.state": {"dtype": "float32", "shape": [len(names)], "names": names},
+        "observation.images.front": {"dtype": "video", "shape": [48, 64, 3], "names": ["height", "width", "channels"]},
+    }
+    if depth:
+        features["observation.depth"] = {"dtype": "uint16", "shape": [48, 64], "names": None}
+        steps = [np.nan_to_num(observation(seed).depth * 1000).round().astype(np.uint16) for seed in (0, 1)]
+        columns["observation.depth"] = pa.array([steps[episode].tolist() for episode in columns["episode_index"]])
+    for folder in ("data/chunk-000", "meta/episodes/chunk-000", "videos/observation.images.front/chunk-000"):
+        (path / folder).mkdir(parents=True)
+    pq.write_table(pa.table(columns), path / "data/chunk-000/file-000.parquet")
+    video = encode_video(np.concatenate([images(seed, length) for seed, length in lengths.items()]), RATE_HZ)
+    (path / "videos/observation.images.front/chunk-000/file-000.mp4").write_bytes(video)
+    key = "videos/observation.images.front"
+    rows = {
+        "episode_index": [0, 1],
+        "tasks": [["push it"], ["push it"]],
+        "length": [20, 30],
+        "data/chunk_index": [0, 0],
+        "data/file_index": [0, 0],
+        f"{key}/chunk_index": [0, 0],
+        f"{key}/file_index": [0, 0],
+        f"{key}/from_timestamp": [0.0, 20 / RATE_HZ],
+        f"{key}/to_timestamp": [20 / RATE_HZ, 50 / RATE_HZ],
+    }
+    pq.write_table(pa.table(rows), path / "meta/episodes/chunk-000/file-000.parquet")
+    info = {
+        "codebase_version": "v3.0",
+        "total_episodes": 2,
+        "total_frames": 50,
+        "fps": int(RATE_HZ),
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+        "features": features,
+    }
+    (path / "meta/info.json").write_text(json.dumps(info))
+    return path
+
+
+def end_effector(demo):
+    """Position, rotation vector and gripper opening in percent, as lerobot's own kinematics write them."""
+    poses = demonstration_poses(demo)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    return np.column_stack([poses[:, :3, 3], turns, 100 * (1 - demo.trajectory.gripper_state[:, 0])])
+
+
+NAMES = ["ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz", "ee.gripper_pos"]
+
+
+def known_rig(**changes):
+    seen = observation(0)
+    facts = {
+        "intrinsics": seen.intrinsics,
+        "camera_pose": seen.camera_pose,
+        "tool": TOOL,
+        "gripper": GripperCommand(open=100, closed=0),
+        "depth_key": "observation.depth",
+        "depth_unit_m": 1e-3,
+    }
+    return Rig(TRIANGLE, **(facts | changes))
+
+
+def test_lerobot_datasets_with_end_effector_poses_become_demonstrations(tmp_path):
+    path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector)
+    demos = import_demonstrations(path, TASK, known_rig())
+    for seed, length, demo in zip((0, 1), (20, 30), demos, strict=True):
+        original = demonstration(seed, steps=length)
+        np.testing.assert_allclose(demo.trajectory.actions, original.trajectory.actions, atol=1e-6)
+        assert np.nanmax(np.abs(demo.observation.depth - original.observation.depth)) < 1e-3
+        # The second episode begins in the middle of the video.
+        assert np.abs(demo.observation.rgb.astype(int) - images(seed, 1)[0]).mean() < 3
+        assert demo.rate_hz == RATE_HZ
+    assert convert_demonstrations(path, tmp_path / "ours", TASK, DESCRIPTION, known_rig()) == 2
+    assert len(list(load_frames(tmp_path / "ours", 1))) == 30
+
+
+def test_quaternions_are_read_too(tmp_path):
+    def state(demo):
+        poses = demonstration_poses(demo)
+        return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+
+    path = lerobot_folder(tmp_path / "theirs", {"axes": ["x", "y", "z", "qx", "qy", "qz", "qw"]}, state)
+    message = refusal(import_demonstrations, path, TASK, known_rig())
+    assert message.endswith("lacks the gripper's commands or positions")
+
+
+def test_what_a_lerobot_dataset_lacks_is_said(tmp_path):
+    joints = [f"joint_{number}.pos" for number in range(6)] + ["gripper.pos"]
+    path = lerobot_folder(tmp_path / "joints", joints, end_effector, depth=False)
+    message = refusal(import_demonstrations, path, TASK, Rig(TRIANGLE))
+    for lacking in ("end-effector poses", "depth", "intrinsics", "camera's pose", "tool frame", "between 0 and 100"):
+        assert lacking in message
+    assert "'observation.depth'" in refusal(import_demonstrations, path, TASK, known_rig())
+    path = lerobot_folder(tmp_path / "unit", NAMES, end_effector)
+    assert "unit" in refusal(import_demonstrations, path, TASK, known_rig(depth_unit_m=None))
+    assert "load_frames" not in refusal(load_demonstrations, path)
+
+
+def test_files_of_no_known_kind_are_refused(tmp_path):
+    assert "no " in refusal(import_demonstrations, tmp_path / "nowhere.h5", TASK, Rig(TRIANGLE))
+    (tmp_path / "noise.h5").write_bytes(b"not hdf5 at all")
+    assert "noise.h5" in refusal(import_demonstrations, tmp_path / "noise.h5", TASK, Rig(TRIANGLE))
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["measurements"] = np.zeros(3)
+    assert "none of the recordings" in refusal(import_demonstrations, tmp_path / "other.h5", TASK, Rig(TRIANGLE))
+    with DatasetWriter(tmp_path / "ours", TASK, DESCRIPTION, RATE_HZ) as writer:
+        writer.add(demonstration(0))
+    assert "load_demonstrations" in refusal(import_demonstrations, tmp_path / "ours", TASK, Rig(TRIANGLE))
+    with pytest.raises(InvalidValueError, match="different"):
+        GripperCommand(open=1, closed=1)
