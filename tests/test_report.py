@@ -57,7 +57,7 @@ def run_folder(tmp_path, plan, observation):
     plan.save(tmp_path / PLAN_FILE)
     observation.save(tmp_path / SEEN_FILE)
     save_context(tmp_path, [observation.rgb] * 3, np.random.default_rng(2).uniform(0, 64, (3, KEYPOINTS, 2)))
-    RunRecord("push-cube", "Push it.", 7, "a model", "rip", False, "failed: it <slipped>", plan.usage.stages).save(
+    RunRecord("push-cube", "push it", 7, "a model", "rip", False, "failed: it <slipped>", plan.usage.stages).save(
         tmp_path
     )
     return tmp_path

@@ -7,6 +7,7 @@ import errno
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from robust_instant_policy import __version__
 from robust_instant_policy.errors import RipError, UsageError
@@ -113,7 +114,7 @@ def _method_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--downsampling", choices=("masked", "uniform"), default="masked")
 
 
-def _method_settings(options: argparse.Namespace) -> dict[str, str]:
+def _method_settings(options: argparse.Namespace) -> dict[str, Any]:
     return {name: getattr(options, name) for name in ("frames", "layout", "features", "downsampling")}
 
 

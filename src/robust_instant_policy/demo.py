@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,7 @@ VIDEO_FPS = 20
 
 
 def run_demo(
-    task_name: str, llm_spec: str, seed: int, demonstrations: str, out: Path, data: Path, options: dict[str, str]
+    task_name: str, llm_spec: str, seed: int, demonstrations: str, out: Path, data: Path, options: dict[str, Any]
 ) -> RunRecord:
     """Record (unless they are there), plan and execute; writes the run folder ``out``.
 
@@ -53,7 +54,7 @@ def _run(
     demonstrations: str,
     out: Path,
     data: Path,
-    options: dict[str, str],
+    options: dict[str, Any],
     screen: StageConsole,
 ) -> RunRecord:
     shown = _demonstrations(task, demonstrations, data, screen)

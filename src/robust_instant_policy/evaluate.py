@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from robust_instant_policy.console import StageConsole
 from robust_instant_policy.errors import UnknownNameError
@@ -16,7 +17,7 @@ STORE_FILE = "samples.sqlite"
 
 
 def evaluate(
-    experiment: Experiment, llm_spec: str, replay: bool, out: Path, data: Path, options: dict[str, str]
+    experiment: Experiment, llm_spec: str, replay: bool, out: Path, data: Path, options: dict[str, Any]
 ) -> None:
     """Run what is missing of ``experiment`` and print its table.
 
@@ -35,7 +36,7 @@ def evaluate(
     model = ReplayedModel(store, llm_spec) if replay else RecordedModel(connect(llm_spec), store)
 
     def make_instant(task: Task) -> InstantPolicy:
-        return InstantPolicy(model, workspace=task.workspace, **options)  # type: ignore[arg-type]
+        return InstantPolicy(model, workspace=task.workspace, **options)
 
     def on_recording(task: str, there: int, count: int, thrown_away: int) -> None:
         screen.done_so_far(f"{task}: recording ({thrown_away} thrown away)", there, count)

@@ -136,7 +136,7 @@ def _head(record: RunRecord, plan: Plan) -> str:
     confidence = "" if plan.confidence is None else f" Confidence of the agreement: {plan.confidence:.2f} of 1."
     return (
         f'<h1>{html.escape(record.task)}</h1><p class="outcome {state}">{html.escape(record.outcome)}</p>'
-        f"<p>The task: {html.escape(record.description)} The robot was shown it a few times and never trained. "
+        f"<p>The task: {html.escape(record.description)}. The robot was shown it a few times and never trained. "
         f"A language model ({html.escape(record.llm)}) read those demonstrations as numbers and "
         f"proposed what to do in a "
         f"scene it had not seen (number {record.seed}). {kept}{confidence}</p>"
@@ -430,8 +430,8 @@ p{max-width:80ch}.caption,figcaption{color:#666;font-size:14px}
 video{width:100%;max-width:640px;border-radius:6px;background:#000}
 .seen{display:grid;grid-template-columns:minmax(280px,2fr) 3fr;gap:18px}
 .demos{display:grid;grid-template-columns:repeat(auto-fill,minmax(115px,1fr));gap:8px;align-content:start}
-figure{margin:0}svg{width:100%;border-radius:4px;display:block}svg image{image-rendering:auto}
-svg text{fill:#000;text-anchor:middle;dominant-baseline:central;font-family:sans-serif;font-weight:700}
+figure{margin:0}figure svg{width:100%;border-radius:4px;display:block}
+figure text{fill:#000;text-anchor:middle;dominant-baseline:central;font-family:sans-serif;font-weight:700}
 .panel{background:#fff;border:1px solid #e4e4e0;border-radius:6px;padding:8px}
 table{border-collapse:collapse;background:#fff;font-variant-numeric:tabular-nums}
 th,td{padding:6px 14px;border-bottom:1px solid #e4e4e0;text-align:right}th:first-child,td:first-child{text-align:left}

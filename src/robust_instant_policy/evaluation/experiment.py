@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
@@ -13,10 +14,11 @@ from robust_instant_policy.evaluation.episodes import Episode, EpisodeTable
 from robust_instant_policy.evaluation.rollout import roll_out
 from robust_instant_policy.evaluation.table import success_table
 from robust_instant_policy.policies import InstantPolicy, make_policy
-from robust_instant_policy.tasks import FIRST_TEST_SEED, make_task
+from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.record import record
 from robust_instant_policy.tasks.task import Task
 
+FIRST_TEST_SEED = 100_000  # demonstrations draw scenes from 0 on, tests from here on
 SEEDS_A_RUN = 1_000  # apart, so that runs with different --seed share no scene
 
 
@@ -97,7 +99,7 @@ def run_experiment(
                 task,
                 data / task_name,
                 experiment.num_demonstrations,
-                lambda there, count, thrown, name=task_name: on_recording(name, there, count, thrown),
+                partial(on_recording, task_name),
             )
             instant = make_instant(task).fit(demonstrations)
             for seed, methods in missing.items():

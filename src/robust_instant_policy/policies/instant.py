@@ -6,19 +6,18 @@ meet here; what is done with the samples is up to the policies that own one.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import numpy as np
-
-from robust_instant_policy.context import InContextPrompt
+from robust_instant_policy.context.prompt import Frames, InContextPrompt, Layout
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, PlanningError, UsageError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.llm import LanguageModel
-from robust_instant_policy.perception import KeypointExtractor, LocatedKeypoints
+from robust_instant_policy.perception import KeypointExtractor, Located
 from robust_instant_policy.policies.policy import Progress, Stage, Stopwatch, Usage, no_progress
-from robust_instant_policy.query import Answer
+from robust_instant_policy.query import Answer, Query
 from robust_instant_policy.trajectory import TARGET_STEPS, Trajectory, downsample
 
 MIN_VALID_ANSWERS = 3  # below this nobody can say which one is hallucinated
@@ -29,7 +28,7 @@ QUOTED_ANSWER_CHARS = 160
 class Proposal:
     """What the instant policy saw and proposed for one observation."""
 
-    located: LocatedKeypoints
+    located: Located
     candidates: tuple[Trajectory, ...]
     usage: Usage
     notes: tuple[str, ...]
@@ -49,8 +48,8 @@ class InstantPolicy:
         *,
         num_keypoints: int = 10,
         features: str = "auto",
-        frames: str = "adaptive",
-        layout: str = "factorised",
+        frames: Frames = "adaptive",
+        layout: Layout = "factorised",
         downsampling: str = "masked",
         num_steps: int = TARGET_STEPS,
         temperature: float = 0.7,
@@ -67,13 +66,13 @@ class InstantPolicy:
             num_keypoints=num_keypoints, features=features, workspace=workspace, seed=seed
         )
         self.prompt = InContextPrompt(frames=frames, layout=layout)
-        self._latest: tuple[Observation, int, Proposal] | None = None
+        self._heard: _Heard | None = None
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> InstantPolicy:
         """Find the common keypoints of ``demonstrations`` and write them down as context; returns itself."""
         if not demonstrations:
             raise DatasetError("no demonstrations; show the task at least once (rip record)")
-        self._latest = None
+        self._heard = None
         self.progress("keypoints", 0, 0)
         self.extractor.fit([demonstration.observation for demonstration in demonstrations])
         self.context_ = tuple(
@@ -93,46 +92,70 @@ class InstantPolicy:
             raise UsageError("call fit(demonstrations) before asking for a plan")
         if num_queries < 1:
             raise UsageError(f"the number of queries must be at least 1, got {num_queries}")
-        if self._latest is not None and self._latest[:2] == (observation, num_queries):
-            return self._latest[2]
-        watch = Stopwatch()
-        self.progress("keypoints", 0, 0)
-        with watch.stage("keypoints"):
-            located = self.extractor.locate(observation)
-        queries = self.prompt.queries(located.keypoints)
-        with watch.stage("language model"):
-            answers = self.llm.sample(
-                queries,
-                num_queries,
-                temperature=self.temperature,
-                seed=self.seed,
-                deadline_s=self.deadline_s,
-                accept=self.prompt.accepts,
-                on_progress=lambda done, total: self.progress("language model", done, total),
-            )
-        watch.stages[-1] = _with_tokens(watch.stages[-1], answers)
+        heard = self._heard if self._heard is not None and self._heard.observation is observation else None
+        if heard is None:
+            watch = Stopwatch()
+            self.progress("keypoints", 0, 0)
+            with watch.stage("keypoints"):
+                located = self.extractor.locate(observation)
+            queries = self.prompt.queries(located.keypoints)
+            heard = self._heard = _Heard(observation, located, watch.stages[0], queries, [[] for _ in queries])
+        self._ask(heard, num_queries)
+        answers = [of_query[:num_queries] for of_query in heard.answers]
         count = min(len(of_query) for of_query in answers)
         if count < min(MIN_VALID_ANSWERS, num_queries):
             raise PlanningError(_too_few(count, num_queries, answers))
         candidates = tuple(
-            self.prompt.trajectory([of_query[index].text for of_query in answers], located.keypoints)
+            self.prompt.trajectory([of_query[index].text for of_query in answers], heard.located.keypoints)
             for index in range(count)
         )
-        notes = (*self.extractor.notes_, *located.notes)
+        notes = (*self.extractor.notes_, *heard.located.notes)
         if count < num_queries:
             notes = (*notes, f"{count} of {num_queries} answers were usable in time")
-        proposal = Proposal(located, candidates, Usage(tuple(watch.stages)), notes)
-        self._latest = (observation, num_queries, proposal)
-        return proposal
+        return Proposal(heard.located, candidates, Usage((heard.locating, _sampling(heard, answers))), notes)
+
+    def _ask(self, heard: _Heard, num_queries: int) -> None:
+        """Sample what ``heard`` lacks of ``num_queries`` answers a query."""
+        if heard.num_asked >= num_queries:
+            return
+        start = time.perf_counter()
+        more = self.llm.sample(
+            heard.queries,
+            num_queries - heard.num_asked,
+            temperature=self.temperature,
+            seed=self.seed,
+            first_index=heard.num_asked,
+            deadline_s=self.deadline_s,
+            accept=self.prompt.accepts,
+            on_progress=lambda done, total: self.progress("language model", done, total),
+        )
+        heard.seconds += time.perf_counter() - start
+        heard.num_asked = num_queries
+        for of_query, new in zip(heard.answers, more, strict=True):
+            of_query.extend(new)
 
 
-def _with_tokens(stage: Stage, answers: Sequence[Sequence[Answer]]) -> Stage:
+@dataclass
+class _Heard:
+    """The answers to one observation so far, so that more can be asked for without asking again."""
+
+    observation: Observation
+    located: Located
+    locating: Stage
+    queries: Sequence[Query]
+    answers: list[list[Answer]]
+    num_asked: int = 0
+    seconds: float = 0.0
+
+
+def _sampling(heard: _Heard, answers: Sequence[Sequence[Answer]]) -> Stage:
     flat = [answer for of_query in answers for answer in of_query]
-    return replace(
-        stage,
-        prompt_tokens=int(np.sum([answer.prompt_tokens for answer in flat], dtype=int)),
-        cached_tokens=int(np.sum([answer.cached_tokens for answer in flat], dtype=int)),
-        completion_tokens=int(np.sum([answer.completion_tokens for answer in flat], dtype=int)),
+    return Stage(
+        "language model",
+        heard.seconds,
+        sum(answer.prompt_tokens for answer in flat),
+        sum(answer.cached_tokens for answer in flat),
+        sum(answer.completion_tokens for answer in flat),
     )
 
 
