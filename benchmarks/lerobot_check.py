@@ -1,11 +1,12 @@
-"""Does the real `lerobot` read our demonstrations folders, and see in them what we see?
+"""Does the real `lerobot` read our demonstrations folders, and see in them what we see? And do we read its?
 
     python benchmarks/lerobot_check.py [--demos DIR] [--venv VENV]
 
 `lerobot` wants another torch than ours, so it lives in an environment of its own, made at VENV if it is not there
 (8 GB, with its CUDA libraries). Every frame of the folder is read with both libraries and compared; without --demos
 a small folder is made up first. With the system's `ffmpeg` installed, lerobot decodes by torchcodec, otherwise by
-PyAV. The result goes to docs/tables/lerobot.md.
+PyAV. The other way round, lerobot writes a small dataset of end-effector poses and the importer reads it. The result
+goes to docs/tables/lerobot.md.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ import venv
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations, load_frames
+from robust_instant_policy.datasets.importers import GripperCommand, Rig, import_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.geometry import GripperTriangle, make_pose
@@ -30,6 +33,8 @@ LEROBOT = "lerobot==0.4.4"
 TABLE = Path(__file__).parent.parent / "docs" / "tables" / "lerobot.md"
 EPISODES, STEPS, RATE_HZ = 3, 120, 55.0
 HEIGHT, WIDTH = 120, 160
+OFFLINE = {"HF_HUB_OFFLINE": "1", "HOME": str(Path.home())}
+MAX_POSE_DIFFERENCE = 1e-5  # float32
 MAX_IMAGE_DIFFERENCE = 3.0  # grey levels, mean: both decode the same H.264, each with its own colour conversion
 
 READ_WITH_LEROBOT = """
@@ -61,6 +66,32 @@ print(json.dumps({
 }))
 """
 
+WRITE_WITH_LEROBOT = """
+import sys
+from pathlib import Path
+
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+root, given = Path(sys.argv[1]), np.load(sys.argv[2])
+names = ["ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz", "ee.gripper_pos"]
+height, width = given["depth"].shape
+dataset = LeRobotDataset.create("local/theirs", fps=int(sys.argv[3]), root=root, features={
+    "observation.state": {"dtype": "float32", "shape": (7,), "names": names},
+    "observation.depth": {"dtype": "float32", "shape": (height, width), "names": ["height", "width"]},
+    "observation.images.front": {
+        "dtype": "video", "shape": (height, width, 3), "names": ["height", "width", "channels"]
+    },
+})
+for states in given["states"]:
+    for step, state in enumerate(states):
+        image = np.full((height, width, 3), 10 + step, np.uint8)
+        dataset.add_frame({"observation.state": state.astype(np.float32), "observation.depth": given["depth"],
+                           "observation.images.front": image, "task": "push the cube"})
+    dataset.save_episode()
+dataset.finalize()
+"""
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -71,7 +102,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         demos = options.demos or make_up(Path(scratch) / "demos")
         rows = [check(python, demos, backend, Path(scratch) / "frames.npz") for backend in ("pyav", "torchcodec")]
-    text = table(rows)
+        back = check_import(python, Path(scratch))
+    text = table(rows) + f"\nThe other way round: {back}\n"
     print(text)
     TABLE.parent.mkdir(parents=True, exist_ok=True)
     TABLE.write_text(text)
@@ -152,6 +184,50 @@ def check(python: Path, folder: Path, backend: str, frames: Path) -> dict[str, o
         sys.exit(f"{folder}: lerobot ({backend}) and we disagree about {', '.join(wrong)}")
     result = f"equal: {', '.join(agree)}"
     return {**told, "decoder": backend, "images": len(theirs["images"]), "difference": difference, "result": result}
+
+
+def check_import(python: Path, scratch: Path) -> str:
+    """Import a dataset that lerobot wrote; a sentence on what was compared. Stops where something differs."""
+    random = np.random.default_rng(1)
+    poses = np.tile(np.eye(4), (2, 40, 1, 1))
+    turns = random.normal(size=(2, 40, 3)).cumsum(axis=1) * 0.02
+    poses[..., :3, :3] = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix().reshape(2, 40, 3, 3)
+    poses[..., :3, 3] = random.normal(size=(2, 40, 3)).cumsum(axis=1) * 0.005
+    opening = np.repeat([100.0, 0.0], 20)
+    states = np.concatenate([poses[..., :3, 3], turns, np.tile(opening, (2, 1))[..., None]], axis=-1)
+    depth = random.uniform(0.5, 1.5, (64, 96)).astype(np.float32)
+    np.savez(scratch / "given.npz", states=states, depth=depth)
+    command = [python, "-c", WRITE_WITH_LEROBOT, scratch / "theirs", scratch / "given.npz", "20"]
+    subprocess.run(command, check=True, capture_output=True, text=True, env=OFFLINE)
+    triangle = GripperTriangle(length=0.1, opening=0.08)
+    rig = Rig(
+        triangle,
+        intrinsics=np.array([[90.0, 0, 47.5], [0, 90.0, 31.5], [0, 0, 1]]),
+        camera_pose=np.eye(4),
+        tool=np.eye(4),
+        gripper=GripperCommand(open=100, closed=0),
+        depth_key="observation.depth",
+        depth_unit_m=1.0,
+    )
+    demos = import_demonstrations(scratch / "theirs", "push-cube", rig)
+    largest = max(
+        np.abs(triangle.poses(demo.trajectory.triplets[:, 0]) - given).max()
+        for demo, given in zip(demos, poses, strict=True)
+    )
+    agree = {
+        "poses": largest < MAX_POSE_DIFFERENCE,
+        "gripper": all((demo.trajectory.gripper_state[:, 0] == (opening < 50)).all() for demo in demos),
+        "depth": all(np.array_equal(demo.observation.depth, depth) for demo in demos),
+        "first image": all(abs(float(demo.observation.rgb.mean()) - 10) < MAX_IMAGE_DIFFERENCE for demo in demos),
+        "rate": all(demo.rate_hz == 20.0 for demo in demos),
+    }
+    wrong = [name for name, same in agree.items() if not same]
+    if wrong:
+        sys.exit(f"imported from lerobot, {', '.join(wrong)} differ from what was given")
+    return (
+        f"two episodes written by {LEROBOT.replace('==', ' ')} and imported agree in {', '.join(agree)} "
+        f"(largest difference of a pose entry {largest:.1e})."
+    )
 
 
 def table(rows: list[dict[str, object]]) -> str:
