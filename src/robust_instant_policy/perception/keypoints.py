@@ -13,9 +13,9 @@ from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError
 from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
 from robust_instant_policy.perception.cloud import Cloud, foreground
-from robust_instant_policy.perception.descriptors import DescriptorMap, IntArray
+from robust_instant_policy.perception.descriptors import DescriptorMap, Float32Array, IntArray
 from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors
-from robust_instant_policy.perception.registration import polish, proposals
+from robust_instant_policy.perception.registration import painted, polish, proposals
 from robust_instant_policy.perception.settings import PAPER_SIMULATION, DescriptorSettings
 
 MIN_FIT = 0.15  # share of an object's points that must be explained in every demonstration
@@ -44,8 +44,7 @@ class _View:
     observation: Observation
     descriptors: DescriptorMap
     cloud: Cloud
-    points: FloatArray  # an even choice of the cloud's points
-    colours: FloatArray
+    painted: Float32Array  # an even choice of the cloud's points with their colours
     cells: IntArray  # cells with foreground in them
     cell_points: FloatArray  # their mean points
 
@@ -75,10 +74,14 @@ class _Body:
         )
         source = np.concatenate([points for _, _, points in self.seen])
         motions = proposals(source, view.cell_points, similar)
-        motions, fits = polish(motions, self.points, self.colours, view.points, view.colours)
-        agreements = np.array([self._agreement(motion, view, similar) for motion in motions])
-        best = int((fits + agreements).argmax())
-        return Registration(motions[best], float(fits[best]), float(agreements[best]))
+        return Registration(
+            *polish(
+                motions,
+                painted(self.points, self.colours),
+                view.painted,
+                lambda motions: np.array([self._agreement(motion, view, similar) for motion in motions]),
+            )
+        )
 
     def _agreement(self, motion: FloatArray, view: _View, similar: FloatArray) -> float:
         """Mean similarity of the object's descriptors with those where ``motion`` puts them, best demonstration."""
@@ -190,7 +193,12 @@ class KeypointExtractor:
             ]
         )
         return _View(
-            observation, descriptors, cloud, cloud.points[kept], cloud.colours[kept], cells, sums / counts[:, None]
+            observation,
+            descriptors,
+            cloud,
+            painted(cloud.points[kept], cloud.colours[kept]),
+            cells,
+            sums / counts[:, None],
         ), note
 
     def _bodies(self, views: list[_View]) -> tuple[list[_Body], list[list[FloatArray]]]:

@@ -7,18 +7,26 @@ Objects stand on a table, so motions turn about the world's vertical only.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.perception.descriptors import Float32Array
 
 TURN_BINS = 36
 SHIFT_BIN_M = 0.015
 PEAKS = 4
 MATCHES_PER_POINT = 3
 VOTE_SHARPNESS = 4  # power of the similarity with which a match votes
-COLOUR_SCALE_M = 0.10  # metres that count as much as the difference between black and white in one channel
+COLOUR_SCALE_M = 0.06  # metres that count as much as the difference between black and white in one channel
 NEAR_M = 0.010  # residual at which a point counts about a third
-ICP_REACH_M = (0.05, 0.04, 0.03, 0.02, 0.015, 0.012, 0.01, 0.01, 0.01, 0.01)  # matches much further apart do not pull
+OWN_M = 0.04  # image points further from the object are not its own
+VARIANT_TURN = np.deg2rad(25)
+COARSE_POINTS = 60
+FINALISTS = 3
+COARSE_REACH_M = (0.06, 0.05, 0.04, 0.03, 0.025, 0.02, 0.02, 0.02)
+FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
 
 
 def turns_about_vertical(angles: FloatArray) -> FloatArray:
@@ -80,22 +88,67 @@ def proposals(source: FloatArray, target: FloatArray, similarities: FloatArray) 
 
 
 def polish(
-    motions: FloatArray, points: FloatArray, colours: FloatArray, target: FloatArray, target_colours: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Refine ``motions (P, 4, 4)`` by closest points in space and colour; also how well each fits, ``(P,)`` in [0, 1].
+    motions: FloatArray, source: FloatArray, target: FloatArray, agreement: Callable[[FloatArray], FloatArray]
+) -> tuple[FloatArray, float, float]:
+    """The best of ``motions (P, 4, 4)`` after refinement, and its fit and agreement, both in [0, 1].
 
-    ``points (N, 3)`` with ``colours (N, 3)`` are the object; ``target (M, 3)`` with ``target_colours`` the image.
+    ``source (N, 6)`` and ``target (M, 6)`` are points with their colours (see `painted`); ``agreement`` says how well
+    the descriptors agree with each of several motions. First all motions, and the same turned by `VARIANT_TURN`
+    either way, on a few points; then the best `FINALISTS` on all points.
     """
-    painted = np.concatenate([target, target_colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
-    squared = (painted**2).sum(axis=1)
-    own = np.broadcast_to((colours * COLOUR_SCALE_M).astype(np.float32), (len(motions), *colours.shape))
-    for reach in (*ICP_REACH_M, 0.0):
-        moved = points @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
-        query = np.concatenate([moved.astype(np.float32), own], axis=2)
-        costs = squared - 2 * (query.reshape(-1, 6) @ painted.T)
-        nearest = costs.argmin(axis=1)
-        distance = ((query.reshape(-1, 6) - painted[nearest]) ** 2).sum(axis=1).reshape(len(motions), -1)
+    middle = source[:, :3].mean(axis=0)
+    turned = [motions]
+    for angle in (-VARIANT_TURN, VARIANT_TURN):
+        variant = motions.copy()
+        variant[:, :3, :3] = turns_about_vertical(np.array(angle)) @ motions[:, :3, :3]
+        variant[:, :3, 3] += (motions[:, :3, :3] - variant[:, :3, :3]) @ middle
+        turned.append(variant)
+    coarse = source[:: max(1, len(source) // COARSE_POINTS)], target[:: max(1, len(target) // (3 * COARSE_POINTS))]
+    motions, fits = closest_points(np.concatenate(turned), *coarse, COARSE_REACH_M)
+    leading = np.argsort(-fits - agreement(motions))[:FINALISTS]
+    motions, fits = closest_points(motions[leading], source, target, FINE_REACH_M)
+    agreements = agreement(motions)
+    best = int((fits + agreements).argmax())
+    return motions[best], float(fits[best]), float(agreements[best])
+
+
+def closest_points(
+    motions: FloatArray, source: FloatArray, target: FloatArray, reaches: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """ICP in both directions, one round for each of ``reaches`` (metres), matches much further apart not pulling.
+
+    Both directions, because an object slid along itself covers its old place well: only the points left bare tell.
+    """
+    count, size = len(motions), len(source)
+    shape = (count, size, len(target))
+    squared = (target**2).sum(axis=1)
+    fits = np.zeros(count)
+    for reach in (*reaches, 0.0):
+        moved = np.concatenate(
+            [
+                source[:, :3] @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3],
+                np.broadcast_to(source[:, 3:], (count, size, 3)),
+            ],
+            axis=2,
+        ).astype(np.float32)
+        costs = (moved**2).sum(axis=2)[..., None] + squared - 2 * (moved.reshape(-1, 6) @ target.T).reshape(shape)
+        forth, back = costs.argmin(axis=2), costs.argmin(axis=1)
+        forth_cost = np.take_along_axis(costs, forth[..., None], axis=2)[..., 0]
+        back_cost = np.take_along_axis(costs, back[:, None], axis=1)[:, 0]
+        own = back_cost < OWN_M**2  # the rest of the image belongs to something else
         if reach:
-            weights = np.exp(-distance / reach**2) + 1e-9
-            motions = upright_motions(points, target[nearest].reshape(moved.shape), weights)
-    return motions, np.exp(-distance / NEAR_M**2).mean(axis=1)
+            weights = np.concatenate([np.exp(-forth_cost / reach**2), own * np.exp(-back_cost / reach**2)], axis=1)
+            source_points = np.concatenate([np.broadcast_to(source[:, :3], (count, size, 3)), source[back, :3]], axis=1)
+            target_points = np.concatenate(
+                [target[forth, :3], np.broadcast_to(target[:, :3], (count, len(target), 3))], axis=1
+            )
+            motions = upright_motions(source_points, target_points, weights + 1e-9)
+        else:
+            explained = (own * np.exp(-back_cost / NEAR_M**2)).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
+            fits = (np.exp(-forth_cost / NEAR_M**2).mean(axis=1) + explained) / 2
+    return motions, fits
+
+
+def painted(points: FloatArray, colours: FloatArray) -> Float32Array:
+    """Points with their colours ``(N, 6)``, all in metres."""
+    return np.concatenate([points, colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
