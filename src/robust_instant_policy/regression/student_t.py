@@ -18,10 +18,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gammaln
+from scipy.special import gammaln, stdtrit
 
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError
 from robust_instant_policy.geometry import FloatArray
@@ -45,6 +46,12 @@ LEFT_OUT = 1e-3  # weight of a sample in such a stretch; not 0, so that a step w
 
 STIFFNESSES = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0])  # prices on squared acceleration, in 1/σ²
 CORNER_DOF = 2.0  # accelerations are Student-t as well: most steps go straight, some turn sharply and stay sharp
+MIN_SLOPE = 0.2  # curvature of the likelihood, against w, that is still believed when errors are estimated
+MIN_FREEDOM = 0.25  # candidates beyond the first, at least, that errors are estimated from
+ALONE = 1.5  # effective candidates below which a step is decided by one, whose error nobody can see: it gets the scale
+POOLED_STEPS = 2  # neighbours on either side over which errors are averaged
+ERROR_FREEDOM = 4.0  # degrees of freedom per candidate of errors pooled over steps and dimensions; sets the coverage
+
 CORNER_SWEEPS = 2  # reweightings of the accelerations at each stiffness tried
 FAINT = 1e-6  # stiffness that only ties down knots between which no candidate has a sample
 NEARLY_GAUSSIAN_DOF = 30.0  # from here on smoothing fades, so that ν → ∞ is the mean of the candidates
@@ -122,6 +129,26 @@ class StudentTRegression:
     def scale(self, times: ArrayLike | None = None) -> FloatArray:
         """The scale σ ``(T, D)`` of trustworthy candidates about the mean at ``times (T,)``."""
         return self._evaluate(np.sqrt(self._state.profile[:, None] * self._state.squared_scale), times)
+
+    def standard_error(self, times: ArrayLike | None = None) -> FloatArray:
+        """How far ``(T, D)`` the mean may be off at ``times (T,)``; infinite for a single candidate."""
+        return self._evaluate(np.sqrt(self._error[0]), times)
+
+    def interval(self, level: float = 0.9, times: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper ends, each ``(T, D)``, between which the truth lies with probability ``level``."""
+        if not 0 < level < 1:
+            raise InvalidValueError(f"level must lie between 0 and 1, got {level} (a scalar, shape ())")
+        error, deciding = self._error
+        freedom = ERROR_FREEDOM * np.maximum(deciding - 1, MIN_FREEDOM)
+        reach = self._evaluate(stdtrit(freedom, (1 + level) / 2)[:, None] * np.sqrt(error), times)
+        mean = self.mean(times)
+        return mean - reach, mean + reach
+
+    @cached_property
+    def _error(self) -> tuple[FloatArray, FloatArray]:
+        if len(self.weights) == 1:
+            return np.full_like(self._state.curve, np.inf), np.ones(len(self.knots))
+        return self._model.squared_error(self._state)
 
     def _evaluate(self, values: FloatArray, times: ArrayLike | None) -> FloatArray:
         if times is None:
@@ -257,6 +284,7 @@ class _Model:
         pulls = np.asfortranarray((pulls / unit).reshape(len(normal[0]), -1))
         target = multiply_banded(normal, state.curve)
         smooth = state
+        inflation = 2 * len(self.data) / (len(self.data) - 1)
         best, choice = np.inf, 0.0
         for stiffness in (0.0, *STIFFNESSES * min(1.0, NEARLY_GAUSSIAN_DOF / self.dof) ** 2):
             self.stiffness = stiffness
@@ -265,7 +293,7 @@ class _Model:
                 smooth = replace(smooth, curve=solve_banded(bands, target))
             moved = (smooth.curve - state.curve) / unit
             risk = (moved * multiply_banded(normal, moved)).sum()
-            risk += 2 * self.inflation * (pulls * solve_banded(bands, pulls)).sum()
+            risk += inflation * (pulls * solve_banded(bands, pulls)).sum()
             if risk < best:
                 best, choice = risk, stiffness
         self.stiffness = choice
@@ -276,10 +304,37 @@ class _Model:
         residuals = self.basis.residuals(self.data.values, state.curve)
         return self.basis.normal_matrix(precision), self.basis.project_each(precision, residuals)
 
-    @property
-    def inflation(self) -> float:
-        """Q / (Q - 1): what residuals of a mean of Q candidates lack of their errors."""
-        return len(self.data) / max(len(self.data) - 1, 1)
+    def squared_error(self, state: _State) -> tuple[FloatArray, FloatArray]:
+        """Expected squared error of the curve ``(K, D)``, and the number of candidates ``(K,)`` that decide it.
+
+        The scatter of the candidates' pulls, each as a whole, so that errors that wander along a candidate count in
+        full; plus what smoothing moved the curve beyond what it took out of that scatter, its bias. A residual shows
+        less than the error: the mean of n candidates moves with each of them (n - 1) / n; and moves more than w says,
+        because w falls with the residual: the curvature of the likelihood is w (1 - 2/p · δ² / (ν + δ²)).
+        """
+        distance = self._distance(self._squares(state), state)
+        weights = self.trust * expected_precision(distance, self.dof)
+        shared = len(state.squared_scale) * (self.data.lengths.mean() if self.unit == "trajectory" else 1)
+        slope = 1 - 2 / shared * (weights @ (distance / (self.dof + distance))) / weights.sum()
+        by_candidate = self.basis.project_each(weights, np.ones((len(weights), 1)))[:, :, 0]
+        deciding = by_candidate.sum(axis=1) ** 2 / (by_candidate**2).sum(axis=1)
+        inflation = deciding / np.maximum(deciding - 1, MIN_FREEDOM) / max(slope, MIN_SLOPE) ** 2
+
+        normal, pulls = self.pulls(state)
+        flat = pulls.reshape(len(pulls), -1)
+        bands = normal + self._price_matrix(self._acceleration(state))
+        smoothed = solve_banded(bands, flat).reshape(pulls.shape)
+        error = inflation[:, None] * (smoothed**2).sum(axis=1)
+        if self.stiffness:
+            faint = normal + self.roughness.matrix(np.full(self.roughness.count, FAINT))
+            unsmoothed = solve_banded(faint, flat).reshape(pulls.shape)
+            moved = solve_banded(faint, pulls.sum(axis=1)) ** 2
+            removed = inflation[:, None] * ((unsmoothed - smoothed) ** 2).sum(axis=1)
+            error += np.maximum(_pooled((moved - removed) @ self.groups), 0.0)
+        error = _pooled(error @ self.groups)
+        alone = deciding < ALONE
+        error[alone] += (state.profile[:, None] * state.squared_scale)[alone]
+        return error, deciding
 
     def _acceleration(self, state: _State) -> FloatArray:
         """Mean squared acceleration ``(K-2,)``, in scales."""
@@ -311,3 +366,11 @@ class _Model:
         elif not self.basis.on_knots:
             total -= 0.5 * dimension * FAINT * acceleration.sum()
         return float(total)
+
+
+def _pooled(rows: FloatArray) -> FloatArray:
+    """Means ``(K, D)`` of ``rows (K, D)`` over each one and its neighbours."""
+    sums = np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(rows, axis=0)])
+    index = np.arange(len(rows))
+    last, first = np.minimum(index + POOLED_STEPS + 1, len(rows)), np.maximum(index - POOLED_STEPS, 0)
+    return (sums[last] - sums[first]) / (last - first)[:, None]
