@@ -20,7 +20,6 @@ MIN_NEIGHBOURS = 3  # of four; a pixel that agrees with fewer flies
 TABLE_TOLERANCE = 0.006  # metres; points this near to the plane belong to it
 LIFTED = 0.010  # metres above the table from which a point belongs to an object
 PLANE_SAMPLES = 60
-SALIENT = 0.5  # saliency from which a flat point counts as an object
 STRANGE = 4.0  # deviations from the table's colour that the surroundings of a flat point need too
 STRANGE_ITSELF = 2.5  # and the point itself, so that objects have no halo
 INLIER_DEVIATIONS = 3.0
@@ -85,7 +84,7 @@ def table_plane(points: FloatArray, seed: int) -> FloatArray:
 
 
 def foreground(
-    observation: Observation, descriptors: DescriptorMap, workspace: FloatArray | None, seed: int
+    observation: Observation, descriptors: DescriptorMap, salient: float, workspace: FloatArray | None, seed: int
 ) -> tuple[Cloud, str]:
     """The points that stand out by height above the table or by saliency, and a line about the depth's unit."""
     depth, note = in_metres(observation.depth)
@@ -124,7 +123,7 @@ def foreground(
     if flat.sum() > MIN_FLAT:
         evened = strangeness(smooth[index[flat, 1], index[flat, 0]])
         strange[flat] = (evened > STRANGE) & (strangeness(colours[flat]) > STRANGE_ITSELF)
-    stands_out = strange & (descriptors.saliency.reshape(-1)[cells] > SALIENT)
+    stands_out = strange & (descriptors.saliency.reshape(-1)[cells] > salient)
     chosen = (above > LIFTED) | (flat & stands_out)
     mask = np.zeros(depth[::every, ::every].shape, dtype=bool)
     place = index[chosen, 1] // every, index[chosen, 0] // every

@@ -17,7 +17,7 @@ def in_metres(depth: ArrayLike) -> tuple[NDArray[np.float32], str]:
     depth = np.array(depth, dtype=np.float32)
     depth[~np.isfinite(depth) | (depth <= 0)] = np.nan
     if np.isfinite(depth).any() and np.nanmedian(depth) > MILLIMETRES_ABOVE:
-        return depth / 1000, f"depth with a median of {np.nanmedian(depth):.0f} was read as millimetres"
+        return depth / np.float32(1000), f"depth with a median of {np.nanmedian(depth):.0f} was read as millimetres"
     return depth, ""
 
 

@@ -13,8 +13,8 @@ from robust_instant_policy.perception.settings import DescriptorSettings
 BLOCKS = (2, 4, 10)  # the last blocks at strides 4, 8 and 16
 FINEST_STRIDE = 4  # input pixels between the cells of block 2
 COARSEST_STRIDE = 16
-MEAN = (0.485, 0.456, 0.406)
-DEVIATION = (0.229, 0.224, 0.225)
+MEAN = np.array((0.485, 0.456, 0.406), dtype=np.float32)
+DEVIATION = np.array((0.229, 0.224, 0.225), dtype=np.float32)
 SALIENCY_PERCENTILE = 99.5  # of the distances from the background; one odd cell must not set the scale
 
 
@@ -27,6 +27,7 @@ class EfficientNetDescriptors:
     """
 
     name = "efficientnet-lite0"
+    salient = 0.5
 
     def __init__(self, settings: DescriptorSettings):
         try:
@@ -59,7 +60,7 @@ class EfficientNetDescriptors:
             Image.Resampling.LANCZOS,
         )
         enlarged = np.asarray(loaded.resize((cols, rows), Image.Resampling.BICUBIC), dtype=np.float32) / 255
-        batch = torch.from_numpy((enlarged - np.float32(MEAN)) / np.float32(DEVIATION)).permute(2, 0, 1)[None]
+        batch = torch.from_numpy((enlarged - MEAN) / DEVIATION).permute(2, 0, 1)[None]
         with torch.inference_mode():
             features = self._forward(batch)[0].permute(1, 2, 0).contiguous().numpy()
         step = np.array([width / cols, height / rows]) * FINEST_STRIDE

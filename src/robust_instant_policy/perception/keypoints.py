@@ -14,7 +14,7 @@ from robust_instant_policy.errors import InvalidValueError, KeypointError
 from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
 from robust_instant_policy.perception.cloud import Cloud, foreground
 from robust_instant_policy.perception.descriptors import DescriptorMap, Float32Array, IntArray
-from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors
+from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.registration import painted, polish, proposals
 from robust_instant_policy.perception.settings import PAPER_SIMULATION, DescriptorSettings
 
@@ -115,7 +115,7 @@ def thin(indices: IntArray, count: int, seed: int) -> IntArray:
 class KeypointExtractor:
     """Finds keypoints that all demonstrations share, and finds the same ones in new images.
 
-    ``num_keypoints``: K. ``features``: ``"auto"`` or ``"efficientnet"``. ``workspace (2, 3)``: lower and upper
+    ``num_keypoints``: K. ``features``: see `choose_network`. ``workspace (2, 3)``: lower and upper
     corner in metres, world; points outside are not looked at. Deterministic for a ``seed``.
 
     After `fit`: ``keypoints_ (I, K, 3)`` metres, world; ``pixels_ (I, K, 2)`` (u, v); ``descriptor_name_``;
@@ -143,9 +143,9 @@ class KeypointExtractor:
     def fit(self, observations: Sequence[Observation]) -> KeypointExtractor:
         if not observations:
             raise KeypointError("no demonstrations were given; record at least one")
-        self._network = EfficientNetDescriptors(self.settings)
+        self._network, note = choose_network(self.features, self.settings)
         self.descriptor_name_ = self._network.name
-        notes = [f"features: {self._network.name} (ships with a package; works offline)"]
+        notes = [note]
         views = []
         for observation in observations:
             view, note = self._view(observation)
@@ -181,7 +181,7 @@ class KeypointExtractor:
 
     def _view(self, observation: Observation) -> tuple[_View, str]:
         descriptors = self._network.describe(observation.rgb)
-        cloud, note = foreground(observation, descriptors, self.workspace, self.seed)
+        cloud, note = foreground(observation, descriptors, self._network.salient, self.workspace, self.seed)
         if len(cloud.points) < MIN_OBJECT_POINTS:
             raise KeypointError("nothing stands out from the table in an image; is the object in the workspace?")
         cells, inverse, counts = np.unique(cloud.cells, return_inverse=True, return_counts=True)

@@ -88,7 +88,7 @@ def proposals(source: FloatArray, target: FloatArray, similarities: FloatArray) 
 
 
 def polish(
-    motions: FloatArray, source: FloatArray, target: FloatArray, agreement: Callable[[FloatArray], FloatArray]
+    motions: FloatArray, source: Float32Array, target: Float32Array, agreement: Callable[[FloatArray], FloatArray]
 ) -> tuple[FloatArray, float, float]:
     """The best of ``motions (P, 4, 4)`` after refinement, and its fit and agreement, both in [0, 1].
 
@@ -113,7 +113,7 @@ def polish(
 
 
 def closest_points(
-    motions: FloatArray, source: FloatArray, target: FloatArray, reaches: tuple[float, ...]
+    motions: FloatArray, source: Float32Array, target: Float32Array, reaches: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """ICP in both directions, one round for each of ``reaches`` (metres), matches much further apart not pulling.
 

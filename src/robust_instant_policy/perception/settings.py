@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+FACETS = ("key", "query", "value", "token")
+
 
 @dataclass(frozen=True)
 class DescriptorSettings:
