@@ -5,13 +5,14 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from robust_instant_policy import Observation, Plan
 from robust_instant_policy.cli import main
-from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 
 
 def refused(arguments: list[str], capsys) -> tuple[int, str]:
@@ -56,12 +57,13 @@ def test_a_missing_or_empty_demonstrations_folder_is_told(workbench, tmp_path, m
         assert str(folder) in line
 
 
-def test_demonstrations_of_another_task_are_refused(workbench, monkeypatch, capsys):
-    monkeypatch.chdir(workbench)
-    code, line = refused(["demo", "--task", "pick-banana", "--demos", "data/push-cube"], capsys)
+def test_demonstrations_of_another_task_are_refused(workbench, tmp_path, capsys):
+    with DatasetWriter(tmp_path / "other", task="peel-banana", description="", rate_hz=55.0) as writer:
+        writer.add(replace(load_demonstrations(workbench / "data/push-cube")[0], task="peel-banana"))
+    code, line = refused(["demo", "--task", "push-cube", "--demos", str(tmp_path / "other")], capsys)
     assert code == 1
     assert "push-cube" in line
-    assert "pick-banana" in line
+    assert "peel-banana" in line
 
 
 def test_a_depth_image_of_zeros_is_told(workbench, tmp_path, capsys):

@@ -30,6 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"rip: {error}", file=sys.stderr)
         return error.exit_code
+    except BrokenPipeError:  # the reader, such as head, has seen enough
+        sys.stderr.close()
+        return 0
     except OSError as error:
         if options.debug:
             raise
@@ -102,6 +105,14 @@ def _parser() -> argparse.ArgumentParser:
 
     report = command("report", _report, "write the report of a run folder again")
     report.add_argument("folder", type=Path, metavar="DIR")
+
+    view = command("view", _view, "a page that shows every demonstration of a folder")
+    view.add_argument("--demos", type=Path, required=True, metavar="DIR")
+    view.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR.html)")
+
+    samples = command("samples", _samples, "what a file of stored answers holds; export it")
+    samples.add_argument("file", type=Path, metavar="FILE", help="samples.sqlite of an evaluation")
+    samples.add_argument("--export", choices=("jsonl", "csv"), help="write all answers to standard output")
 
     command("doctor", _doctor, "what works on this machine, and what to do about what does not")
     return parser
@@ -215,6 +226,34 @@ def _report(options: argparse.Namespace) -> int:
     from robust_instant_policy.report import write_report
 
     print(write_report(options.folder))
+    return 0
+
+
+def _view(options: argparse.Namespace) -> int:
+    from robust_instant_policy.datasets.page import write_page
+
+    print(write_page(options.demos, options.out or options.demos.with_name(options.demos.name + ".html")))
+    return 0
+
+
+def _samples(options: argparse.Namespace) -> int:
+    from robust_instant_policy.llm import SampleStore
+
+    if not options.file.exists():
+        raise UsageError(f"no stored answers at {options.file}; rip eval --out DIR keeps them in DIR/samples.sqlite")
+    store = SampleStore(options.file)
+    try:
+        if options.export:
+            store.export(sys.stdout, options.export)
+            return 0
+        print(f"{'model':<40}{'prompts':>10}{'answers':>10}{'tokens given':>15}{'tokens written':>16}")
+        for held in store.models():
+            print(
+                f"{held.model:<40}{held.queries:>10,}{held.answers:>10,}"
+                f"{held.prompt_tokens:>15,}{held.completion_tokens:>16,}"
+            )
+    finally:
+        store.close()
     return 0
 
 
