@@ -12,12 +12,12 @@ SURFACE_TOLERANCE = 0.015  # share of the depth within which neighbouring readin
 MIN_SUPPORT = 3  # readings of a surface below which it is taken for flying pixels
 
 
-def in_metres(depth: ArrayLike) -> tuple[NDArray[np.float32], str]:
+def in_metres(image: ArrayLike) -> tuple[NDArray[np.float32], str]:
     """Depth with NaN for every missing reading, in metres, and a line that says so if it was in millimetres."""
-    depth = np.array(depth, dtype=np.float32)
+    depth: NDArray[np.float32] = np.array(image, dtype=np.float32)
     depth[~np.isfinite(depth) | (depth <= 0)] = np.nan
     if np.isfinite(depth).any() and np.nanmedian(depth) > MILLIMETRES_ABOVE:
-        return depth / np.float32(1000), f"depth with a median of {np.nanmedian(depth):.0f} was read as millimetres"
+        return (depth / 1000).astype(np.float32), f"depth with a median of {np.nanmedian(depth):.0f} was read as millimetres"
     return depth, ""
 
 
