@@ -123,10 +123,14 @@ def _method_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--layout", choices=("factorised", "sequence"), default="factorised")
     parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
     parser.add_argument("--downsampling", choices=("masked", "uniform"), default="masked")
+    parser.add_argument(
+        "--deadline", type=_positive, default=300, metavar="SECONDS", help="for the answers of one plan (default: 300)"
+    )
 
 
 def _method_settings(options: argparse.Namespace) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in ("frames", "layout", "features", "downsampling")}
+    settings = {name: getattr(options, name) for name in ("frames", "layout", "features", "downsampling")}
+    return {**settings, "deadline_s": float(options.deadline)}
 
 
 def _natural(text: str) -> int:

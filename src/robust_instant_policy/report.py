@@ -19,9 +19,9 @@ from plotly.subplots import make_subplots
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.geometry import FloatArray, GripperTriangle
+from robust_instant_policy.geometry import FloatArray, GripperTriangle, project
 from robust_instant_policy.policies.policy import Plan, Stage
-from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
+from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 MM = 1000.0
 SHOWN_DEMONSTRATIONS = 10
@@ -115,6 +115,7 @@ def write_report(folder: str | Path) -> Path:
         plotly=get_plotlyjs(),
         head=_head(record, plan),
         video=_video(folder / VIDEO_FILE),
+        proposals=_proposals_over_scene(observation, plan),
         seen=_seen(observation.rgb, plan, images, pixels),
         paths=_html(_paths_in_space(plan)),
         dimensions=_html(_dimensions_over_time(plan)),
@@ -157,9 +158,6 @@ def _numbered(
     image: NDArray[np.uint8], pixels: FloatArray, confidence: FloatArray | None, caption: str, kind: str
 ) -> str:
     height, width = image.shape[:2]
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    data = base64.b64encode(buffer.getvalue()).decode()
     radius = 0.022 * width
     marks = []
     for index, (u, v) in enumerate(pixels):
@@ -172,9 +170,46 @@ def _numbered(
         )
     return (
         f'<figure class="{kind}"><svg viewBox="0 0 {width} {height}">'
-        f'<image href="data:image/png;base64,{data}" width="{width}" height="{height}"/>'
-        f"{''.join(marks)}</svg><figcaption>{html.escape(caption)}</figcaption></figure>"
+        f"{_image(image)}{''.join(marks)}</svg><figcaption>{html.escape(caption)}</figcaption></figure>"
     )
+
+
+def _proposals_over_scene(observation: Observation, plan: Plan) -> str:
+    """The scene with the ways of the fingertips drawn over it, hallucinated proposals dotted red."""
+    height, width = observation.rgb.shape[:2]
+
+    def line(trajectory: Trajectory, colour: str, stroke: float, dash: str, name: str) -> str:
+        parts = []
+        for arm in range(trajectory.num_arms):
+            tips = trajectory.triplets[:, arm, 1:].mean(axis=1)
+            pixels = project(tips, observation.intrinsics, observation.camera_pose)
+            points = " ".join(f"{u + 0.5:.1f},{v + 0.5:.1f}" for u, v in pixels)
+            parts.append(
+                f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="{stroke}" '
+                f'stroke-dasharray="{dash}" stroke-linejoin="round"><title>{name}</title></polyline>'
+            )
+        return "".join(parts)
+
+    unit = width / 256
+    lines = [
+        line(plan.trajectory, "#fff", 4.2 * unit, "", ""),
+        line(plan.trajectory, ROBUST_COLOUR, 2.6 * unit, "", "robust"),
+    ]
+    for index, candidate in enumerate(plan.candidates):
+        bad = bool(plan.hallucinated[index])
+        colour = HALLUCINATED_COLOUR if bad else CANDIDATE_COLOURS[index % len(CANDIDATE_COLOURS)]
+        lines.append(line(candidate, colour, 1.1 * unit, f"{2 * unit}" if bad else "", _candidate_name(plan, index)))
+    return (
+        f'<figure class="new"><svg viewBox="0 0 {width} {height}">{_image(observation.rgb)}{"".join(lines)}</svg>'
+        "<figcaption>the proposals and, black, the robust trajectory over the new scene</figcaption></figure>"
+    )
+
+
+def _image(image: NDArray[np.uint8]) -> str:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    data = base64.b64encode(buffer.getvalue()).decode()
+    return f'<image href="data:image/png;base64,{data}" width="{image.shape[1]}" height="{image.shape[0]}"/>'
 
 
 def _seen(rgb: NDArray[np.uint8], plan: Plan, images: Sequence[NDArray[np.uint8]], pixels: FloatArray) -> str:
@@ -428,6 +463,7 @@ p{max-width:80ch}.caption,figcaption{color:#666;font-size:14px}
 .outcome.good{background:#d8f0dc;color:#14532d}.outcome.bad{background:#f8dcdc;color:#7f1d1d}
 .outcome.open{background:#e6e6e6}
 video{width:100%;max-width:640px;border-radius:6px;background:#000}
+.top{display:grid;grid-template-columns:minmax(300px,4fr) 3fr;gap:18px;align-items:start}
 .seen{display:grid;grid-template-columns:minmax(280px,2fr) 3fr;gap:18px}
 .demos{display:grid;grid-template-columns:repeat(auto-fill,minmax(115px,1fr));gap:8px;align-content:start}
 figure{margin:0}figure svg{width:100%;border-radius:4px;display:block}
@@ -437,14 +473,14 @@ table{border-collapse:collapse;background:#fff;font-variant-numeric:tabular-nums
 th,td{padding:6px 14px;border-bottom:1px solid #e4e4e0;text-align:right}th:first-child,td:first-child{text-align:left}
 th{font-size:14px;color:#555}
 tr.bad td{color:#a11d33;font-weight:600}tr.total td{font-weight:600;border-top:2px solid #999}
-@media(max-width:760px){.seen{grid-template-columns:1fr}}
+@media(max-width:760px){.seen,.top{grid-template-columns:1fr}}
 """
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
 <title>{title}</title><style>{style}</style><script>{plotly}</script></head><body><main>
 {head}
-{video}
+<div class="top"><div>{video}</div>{proposals}</div>
 <h2>What the robot saw</h2>
 <p>The camera looks down on the table. The same numbered point marks the same place on the object in every image:
 left the new scene, right the demonstrations. With the depth of each pixel these become points in space, and those

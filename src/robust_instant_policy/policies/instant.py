@@ -21,6 +21,7 @@ from robust_instant_policy.query import Answer, Query
 from robust_instant_policy.trajectory import TARGET_STEPS, Trajectory, downsample
 
 MIN_VALID_ANSWERS = 3  # below this nobody can say which one is hallucinated
+DEADLINE_S = 300.0  # wall time of all the sampling for one plan; a busy laptop may need minutes
 QUOTED_ANSWER_CHARS = 160
 
 
@@ -53,7 +54,7 @@ class InstantPolicy:
         downsampling: str = "masked",
         num_steps: int = TARGET_STEPS,
         temperature: float = 0.7,
-        deadline_s: float = 120.0,
+        deadline_s: float = DEADLINE_S,
         workspace: FloatArray | None = None,
         seed: int = 0,
         progress: Progress = no_progress,
@@ -104,7 +105,7 @@ class InstantPolicy:
         answers = [of_query[:num_queries] for of_query in heard.answers]
         count = min(len(of_query) for of_query in answers)
         if count < min(MIN_VALID_ANSWERS, num_queries):
-            raise PlanningError(_too_few(count, num_queries, answers))
+            raise PlanningError(_too_few(count, num_queries, answers, heard.seconds))
         candidates = tuple(
             self.prompt.trajectory([of_query[index].text for of_query in answers], heard.located.keypoints)
             for index in range(count)
@@ -159,7 +160,12 @@ def _sampling(heard: _Heard, answers: Sequence[Sequence[Answer]]) -> Stage:
     )
 
 
-def _too_few(count: int, wanted: int, answers: Sequence[Sequence[Answer]]) -> str:
+def _too_few(count: int, wanted: int, answers: Sequence[Sequence[Answer]], seconds: float) -> str:
     said = next((answer.text for of_query in answers for answer in of_query), None)
-    heard = f"it said {said[:QUOTED_ANSWER_CHARS]!r}" if said else "it said nothing usable before the deadline"
-    return f"the model gave {count} usable answers of {wanted}, {min(MIN_VALID_ANSWERS, wanted)} are needed; {heard}"
+    heard = f"it said, for one, {said[:QUOTED_ANSWER_CHARS]!r}" if said else "it said nothing usable"
+    answered = sum(len(of_query) == wanted for of_query in answers)
+    return (
+        f"after {seconds:.0f} s there are {count} usable trajectories of {wanted}, {min(MIN_VALID_ANSWERS, wanted)} are "
+        f"needed ({answered} of {len(answers)} prompts answered in full; {heard}); "
+        "give it more time (--deadline) or another model (--llm)"
+    )
