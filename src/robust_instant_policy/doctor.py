@@ -97,9 +97,10 @@ def _embedded_model() -> str:
 
 
 def _features() -> str:
-    from robust_instant_policy.perception import describe_features
+    from robust_instant_policy.perception import PAPER_SIMULATION
+    from robust_instant_policy.perception.network import choose_network
 
-    return describe_features("auto")
+    return choose_network("auto", PAPER_SIMULATION)[1].removeprefix("features: ")
 
 
 def _existing(folder: Path) -> Path:

@@ -165,7 +165,7 @@ def _too_few(count: int, wanted: int, answers: Sequence[Sequence[Answer]], secon
     heard = f"it said, for one, {said[:QUOTED_ANSWER_CHARS]!r}" if said else "it said nothing usable"
     answered = sum(len(of_query) == wanted for of_query in answers)
     return (
-        f"after {seconds:.0f} s there are {count} usable trajectories of {wanted}, {min(MIN_VALID_ANSWERS, wanted)} are "
-        f"needed ({answered} of {len(answers)} prompts answered in full; {heard}); "
+        f"after {seconds:.0f} s there are {count} usable trajectories of {wanted}, {min(MIN_VALID_ANSWERS, wanted)} "
+        f"are needed ({answered} of {len(answers)} prompts answered in full; {heard}); "
         "give it more time (--deadline) or another model (--llm)"
     )
