@@ -9,15 +9,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration, images, with_task
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from robust_instant_policy.datasets import DatasetWriter, VideoWriter, load_demonstrations, load_frames
 from robust_instant_policy.datasets.images import encode_depth, read_depth
+from robust_instant_policy.datasets.video import encode_video
 from robust_instant_policy.errors import DatasetError, InvalidValueError, NoDemonstrationsError
 from robust_instant_policy.trajectory import Trajectory
+from tests.datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration, images, with_task
 
 
 def writer_of(path, task=TASK, rate_hz=RATE_HZ):
@@ -127,6 +128,11 @@ def test_recording_in_one_go_or_in_two_leaves_identical_folders(tmp_path):
     assert len(files) > 12
     for file in files:
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
+
+
+def test_the_same_images_always_make_the_same_video():
+    film = images(0)
+    assert len({encode_video(film, RATE_HZ) for _ in range(80)}) == 1
 
 
 def test_episodes_need_no_seed_and_no_images_and_may_have_two_arms(tmp_path):

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations, load_frames
 from robust_instant_policy.datasets.files import PART_SUFFIX
 from robust_instant_policy.errors import DatasetError
+from tests.datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration
 
 HERE = Path(__file__).parent
 
 OPEN = f"""
 import os, resource, signal, sys
 sys.path.insert(0, {str(HERE)!r})
-from datasets_samples import demonstration, images
+from tests.datasets_samples import demonstration, images
 from robust_instant_policy.datasets import DatasetWriter
 from robust_instant_policy.errors import DatasetError
 folder = sys.argv[1]
@@ -181,3 +181,15 @@ def test_an_interrupted_episode_leaves_the_writer_usable(tmp_path, monkeypatch):
         assert writer.num_episodes == 1
         writer.add(demonstration(2))
     assert [demo.seed for demo in load_demonstrations(tmp_path / "demos")] == [0, 2]
+
+
+def test_a_lost_info_file_never_costs_the_episodes(tmp_path):
+    folder = tmp_path / "demos"
+    with DatasetWriter(folder, TASK, DESCRIPTION, RATE_HZ) as writer:
+        for seed in range(3):
+            writer.add(demonstration(seed))
+    (folder / "meta/info.json").rename(tmp_path / "info.json")
+    with pytest.raises(DatasetError, match="restore"):
+        DatasetWriter(folder, TASK, DESCRIPTION, RATE_HZ)
+    (tmp_path / "info.json").rename(folder / "meta/info.json")
+    assert len(load_demonstrations(folder)) == 3

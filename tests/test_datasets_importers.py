@@ -7,7 +7,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration, images, observation
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations, load_frames
@@ -20,6 +19,7 @@ from robust_instant_policy.datasets.importers import (
 from robust_instant_policy.datasets.video import encode_video
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.geometry import GripperTriangle, lift, make_pose, project
+from tests.datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration, images, observation
 
 TRIANGLE = GripperTriangle(length=0.1, opening=0.08)
 TOOL = np.eye(4)

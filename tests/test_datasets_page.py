@@ -9,10 +9,10 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration, images
 
 from robust_instant_policy.datasets import DatasetWriter, write_page
 from robust_instant_policy.errors import DatasetError
+from tests.datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration, images
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 

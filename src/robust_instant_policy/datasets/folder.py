@@ -20,12 +20,14 @@ from robust_instant_policy.datasets.video import decode_video
 from robust_instant_policy.errors import DatasetError, NoDemonstrationsError
 
 CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
+STATISTICS_PREFIX = "stats/"  # columns of meta/episodes that only those who normalise need
 INFO_ENTRIES = ("codebase_version", "fps", "features", "total_episodes", "total_frames", "data_path")
 
 
 @dataclass(frozen=True)
 class Folder:
-    """A LeRobotDataset v3.0: ``info`` is its ``meta/info.json``, ``episodes`` the rows of ``meta/episodes`` in order.
+    """A LeRobotDataset v3.0: ``info`` is its ``meta/info.json``, ``episodes`` the rows of ``meta/episodes`` in order,
+    without statistics.
 
     Its tables are read when asked for; every method raises `DatasetError`, naming the file, for one that is
     missing or damaged.
@@ -142,7 +144,10 @@ def _read_episodes(root: Path, count: int) -> list[dict[str, Any]]:
     """The first ``count`` rows: what lies beyond was not finished when its writer was killed."""
     rows: list[dict[str, Any]] = []
     for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
-        rows += read_table(path).to_pylist()
+        table = read_table(path)
+        rows += table.select(
+            [name for name in table.column_names if not name.startswith(STATISTICS_PREFIX)]
+        ).to_pylist()
         if len(rows) >= count:
             break
     if [row["episode_index"] for row in rows[:count]] != list(range(count)):

@@ -17,9 +17,15 @@ from robust_instant_policy.errors import DatasetError, InvalidValueError
 
 CODEC = "libx264"
 PIXEL_FORMAT = "yuv420p"
-QUALITY_CRF = "18"  # visually lossless; lower is better and larger
-PRESET = "veryfast"  # a third of the default's time for a slightly larger file
-KEYFRAME_INTERVAL = "10"  # frames; training reads frames at random
+X264_OPTIONS = {
+    "preset": "veryfast",  # a third of the default's time for a slightly larger file
+    "crf": "18",  # visually lossless; lower is better and larger
+    "g": "10",  # frames from one key frame to the next; training reads frames at random
+    "bf": "0",  # no frames out of order
+    # The lookahead's macroblock tree makes a few of a hundred encodings of the same images differ in some bytes.
+    "mbtree": "0",
+    "rc-lookahead": "0",
+}
 MAX_RATE_DENOMINATOR = 1001  # as in 30000/1001 Hz
 
 
@@ -31,8 +37,7 @@ def rate_fraction(rate_hz: float) -> Fraction:
 class VideoEncoder:
     """Makes an MP4 of images ``(H, W, 3)`` uint8, H and W even, one by one.
 
-    One thread and no reordered frames: the same images give the same bytes on every machine, and frame t is
-    shown at exactly t / rate.
+    The same images give the same bytes every time, and frame t is shown at exactly t / rate.
     """
 
     def __init__(self, rate_hz: float):
@@ -43,7 +48,7 @@ class VideoEncoder:
         self._stream.pix_fmt = PIXEL_FORMAT
         self._stream.codec_context.time_base = 1 / self._rate
         self._stream.codec_context.thread_count = 1
-        self._stream.options = {"preset": PRESET, "crf": QUALITY_CRF, "g": KEYFRAME_INTERVAL, "bf": "0"}
+        self._stream.options = X264_OPTIONS
         self.num_images = 0
 
     def add(self, image: NDArray[np.uint8]) -> None:

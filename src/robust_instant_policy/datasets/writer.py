@@ -24,12 +24,13 @@ from robust_instant_policy.datasets.files import (
     write_error,
     write_whole,
 )
-from robust_instant_policy.datasets.folder import Folder, open_folder, read_json
+from robust_instant_policy.datasets.folder import STATISTICS_PREFIX, Folder, open_folder, read_json, read_table
 from robust_instant_policy.datasets.images import encode_depth, encode_png
 from robust_instant_policy.datasets.statistics import Statistics, combine, feature_statistics, image_statistics
 from robust_instant_policy.datasets.video import PIXEL_FORMAT, encode_video
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM
 
 EVEN_TIMING_TOLERANCE = 1e-6  # of an episode's duration
@@ -56,6 +57,9 @@ class DatasetWriter:
             make_folder(self.path)
         except OSError as error:
             raise write_error(self.path, error) from error
+        self._folder: Folder | None = None
+        self._statistics: dict[str, Statistics] = {}
+        self._discarded_seeds: list[int | None] = []
         self._lock: int | None = lock_folder(self.path)
         try:
             self._resume()
@@ -106,12 +110,10 @@ class DatasetWriter:
             raise DatasetError(f"the writer of {self.path} is closed; open a new one to add episodes")
         self._check(demonstration, images)
         try:
-            self._write_episode(demonstration, images)
+            self._folder, self._statistics = self._write_episode(demonstration, images)
         except BaseException:
-            self._remove_unfinished()
+            self._take_up()
             raise
-        finally:
-            self._folder = self._finished()
 
     def _resume(self) -> None:
         """Take up what earlier writers finished, and remove what they did not."""
@@ -122,28 +124,39 @@ class DatasetWriter:
             if own.get("rate_hz") != self.rate_hz:
                 raise DatasetError(f"{self.path} was recorded at {own.get('rate_hz')} Hz, not at {self.rate_hz} Hz")
             self.description = str(own.get("description", self.description))
-            self._discarded_seeds: list[int | None] = list(own.get("discarded_seeds", []))
-            self._folder = self._finished()
-            self._remove_unfinished()
+            self._discarded_seeds = list(own.get("discarded_seeds", []))
+            self._take_up()
             return
         stranger = next(finished_files(self.path), None)
         if stranger is not None:
             raise DatasetError(f"{self.path} holds other files ({stranger.name}); choose an empty or a new folder")
-        self._folder = None
+        self._take_up()
         self._write_own([])
 
-    def _finished(self) -> Folder | None:
-        return open_folder(self.path, self.task) if (self.path / layout.INFO_PATH).exists() else None
+    def _take_up(self) -> None:
+        """Know what is finished, and remove what is not."""
+        self._folder, self._statistics = None, {}
+        if (self.path / layout.INFO_PATH).exists():
+            self._folder = open_folder(self.path, self.task)
+            for episode in range(self.num_episodes):
+                self._statistics = _combined(self._statistics, _read_statistics(self.path, episode))
+        self._remove_unfinished(self.num_episodes)
 
-    def _remove_unfinished(self) -> None:
-        finished = self._finished()
-        count = 0 if finished is None else len(finished.episodes)
-        for top in (*layout.EPISODE_FOLDERS, "meta"):
-            for file in (self.path / top).rglob("*"):
-                match = EPISODE_FILE.search(file.as_posix())
-                beyond = match and int(match[1]) * layout.FILES_PER_CHUNK + int(match[2]) >= count
-                if beyond or file.name.endswith(PART_SUFFIX):
-                    file.unlink(missing_ok=True)
+    def _remove_unfinished(self, count: int) -> None:
+        """Remove the files of episode ``count``, the one under way; those of any other mean damage, and stay."""
+        unfinished = []
+        for file in (file for top in (*layout.EPISODE_FOLDERS, "meta") for file in (self.path / top).rglob("*")):
+            match = EPISODE_FILE.search(file.as_posix())
+            episode = int(match[1]) * layout.FILES_PER_CHUNK + int(match[2]) if match else -1
+            if episode > count:
+                raise DatasetError(
+                    f"{self.path} is damaged: it holds files of episode {episode}, but {layout.INFO_PATH} counts "
+                    f"{count} episodes; restore that file, or choose another folder"
+                )
+            if episode == count or file.name.endswith(PART_SUFFIX):
+                unfinished.append(file)
+        for file in unfinished:
+            file.unlink(missing_ok=True)
 
     def _write_own(self, discarded_seeds: list[int | None]) -> None:
         own = {
@@ -182,12 +195,17 @@ class DatasetWriter:
                     f"{new or 'absent'} in the new episode"
                 )
 
-    def _write_episode(self, demonstration: Demonstration, images: NDArray[np.uint8] | None) -> None:
+    def _write_episode(
+        self, demonstration: Demonstration, images: NDArray[np.uint8] | None
+    ) -> tuple[Folder, dict[str, Statistics]]:
+        """Write an episode, its own files first; the folder and its statistics with it."""
         episode = self.num_episodes
         first_frame = 0 if self._folder is None else int(self._folder.info["total_frames"])
         length = len(demonstration.trajectory)
         columns = self._frame_columns(demonstration, episode, first_frame)
-        statistics = {key: feature_statistics(value.reshape(length, -1)) for key, value in columns.items()}
+        statistics: dict[str, Statistics] = {
+            key: feature_statistics(value.reshape(length, -1)) for key, value in columns.items()
+        }
         chunk, file = layout.chunk_and_file(episode)
         row: dict[str, Any] = {
             "episode_index": episode,
@@ -212,7 +230,11 @@ class DatasetWriter:
         row |= self._write_start(demonstration, episode)
         self._write_file(layout.DATA_PATTERN, episode, _parquet(_frame_table(columns)))
         self._write_file(layout.EPISODES_PATTERN, episode, _parquet(_episode_table(row, statistics)))
-        self._write_dataset(demonstration, images, statistics, first_frame + length)
+        whole = _combined(self._statistics, statistics)
+        features = _features(demonstration.trajectory.num_arms, images, self.rate_hz)
+        info = self._write_dataset(features, whole, episode + 1, first_frame + length)
+        earlier = [] if self._folder is None else self._folder.episodes
+        return Folder(self.path, info, [*earlier, row]), whole
 
     def _frame_columns(self, demonstration: Demonstration, episode: int, first_frame: int) -> dict[str, NDArray]:
         steps = np.arange(len(demonstration.trajectory))
@@ -242,38 +264,29 @@ class DatasetWriter:
         }
 
     def _write_dataset(
-        self,
-        demonstration: Demonstration,
-        images: NDArray[np.uint8] | None,
-        statistics: Mapping[str, Statistics],
-        total_frames: int,
-    ) -> None:
-        """Write the files that speak of the whole folder; the last one finishes the episode."""
-        if self._folder is None:
-            write_whole(self.path / layout.TASKS_PATH, _parquet(_task_table(self.description)))
-            features = _features(demonstration.trajectory.num_arms, images, self.rate_hz)
-        else:
-            features = self._folder.info["features"]
-        rows = [] if self._folder is None else self._folder.episodes
-        parts = [_row_statistics(row, list(statistics)) for row in rows] + [statistics]
-        whole = {key: combine([part[key] for part in parts]) for key in statistics}
-        write_whole(self.path / layout.STATS_PATH, _json({key: _listed(value) for key, value in whole.items()}))
+        self, features: dict[str, Any], statistics: Mapping[str, Statistics], num_episodes: int, num_frames: int
+    ) -> dict[str, Any]:
+        """Write the files that speak of the whole folder; the last one, whose content is returned, finishes it."""
         info = {
             "codebase_version": layout.CODEBASE_VERSION,
             "robot_type": None,
-            "total_episodes": len(parts),
-            "total_frames": total_frames,
+            "total_episodes": num_episodes,
+            "total_frames": num_frames,
             "total_tasks": 1,
             "chunks_size": layout.FILES_PER_CHUNK,
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
             "fps": int(self.rate_hz) if self.rate_hz.is_integer() else self.rate_hz,
-            "splits": {"train": f"0:{len(parts)}"},
+            "splits": {"train": f"0:{num_episodes}"},
             "data_path": layout.DATA_PATTERN,
             "video_path": layout.VIDEO_PATTERN if layout.VIDEO_KEY in features else None,
             "features": features,
         }
+        if num_episodes == 1:
+            write_whole(self.path / layout.TASKS_PATH, _parquet(_task_table(self.description)))
+        write_whole(self.path / layout.STATS_PATH, _json({key: _listed(value) for key, value in statistics.items()}))
         write_whole(self.path / layout.INFO_PATH, _json(info))
+        return info
 
     def _write_file(self, pattern: str, episode: int, content: bytes) -> None:
         write_whole(self.path / layout.episode_path(pattern, episode), content)
@@ -321,13 +334,26 @@ def _episode_table(row: dict[str, Any], statistics: Mapping[str, Statistics]) ->
     table[layout.SEED_COLUMN] = pa.array([row[layout.SEED_COLUMN]], type=pa.int64())
     for key, entries in statistics.items():
         for name, value in _listed(entries).items():
-            table[f"stats/{key}/{name}"] = pa.array([value])
+            table[f"{STATISTICS_PREFIX}{key}/{name}"] = pa.array([value])
     return pa.table(table)
 
 
-def _row_statistics(row: Any, keys: list[str]) -> dict[str, Statistics]:
-    names = [column.split("/")[-1] for column in row if column.startswith(f"stats/{keys[0]}/")]
-    return {key: {name: np.array(row[f"stats/{key}/{name}"]) for name in names} for key in keys}
+def _read_statistics(root: Path, episode: int) -> dict[str, Statistics]:
+    """The statistics that `_episode_table` wrote."""
+    table = read_table(root / layout.episode_path(layout.EPISODES_PATTERN, episode))
+    result: dict[str, dict[str, FloatArray]] = {}
+    for column in table.column_names:
+        if column.startswith(STATISTICS_PREFIX):
+            key, name = column.removeprefix(STATISTICS_PREFIX).rsplit("/", 1)
+            result.setdefault(key, {})[name] = np.array(table[column][0].as_py(), dtype=np.float64)
+    return dict(result)
+
+
+def _combined(earlier: Mapping[str, Statistics], statistics: Mapping[str, Statistics]) -> dict[str, Statistics]:
+    """One episode more; episodes are always taken in one by one, so that a resumed folder gets the same numbers."""
+    if not earlier:
+        return dict(statistics)
+    return {key: combine([earlier[key], statistics[key]]) for key in statistics}
 
 
 def _listed(statistics: Statistics) -> dict[str, list]:
