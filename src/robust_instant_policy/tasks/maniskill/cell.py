@@ -32,6 +32,8 @@ CAMERA_VIEW_M = 0.8  # side of the square of table top that the camera sees
 CAMERA_PIXELS = 256
 VIDEO_WIDTH, VIDEO_HEIGHT = 480, 360
 
+STILL_RAD_S = 0.2  # joint speed below which ManiSkill's tasks take an arm to be at rest
+
 WORKSPACE = np.array([[-0.34, -0.4, -0.005], [0.46, 0.4, 0.4]])
 
 
@@ -63,9 +65,9 @@ class CellEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        pose = sapien_utils.look_at(eye=(0.75, -0.75, 0.75), target=(-0.05, 0.05, 0.15))
+        pose = sapien_utils.look_at(eye=(-0.28, -0.82, 0.62), target=(0.0, 0.04, 0.1))
         return CameraConfig(
-            "render_camera", pose, VIDEO_WIDTH, VIDEO_HEIGHT, fov=0.9, near=0.05, far=20.0, shader_pack="default"
+            "render_camera", pose, VIDEO_WIDTH, VIDEO_HEIGHT, fov=0.85, near=0.05, far=20.0, shader_pack="default"
         )
 
     def _load_agent(self, options: dict) -> None:
@@ -80,6 +82,22 @@ class CellEnv(BaseEnv):
         home = np.array([*HOME_JOINTS, FINGER_TRAVEL_M, FINGER_TRAVEL_M], dtype=np.float32)
         self.agent.reset(home)
         self.agent.robot.set_pose(sapien.Pose(p=BASE_POSITION_M))
+        self._joints_before = self.agent.robot.get_qpos().clone()
+
+    def _before_control_step(self) -> None:
+        self._joints_before = self.agent.robot.get_qpos().clone()
+
+    def arm_is_still(self) -> torch.Tensor:
+        """Whether no arm joint moved faster than `STILL_RAD_S` over the last control step.
+
+        Judged by the angles: with something between the fingers PhysX reports joint speeds that move nothing.
+        """
+        moved = (self.agent.robot.get_qpos() - self._joints_before)[:, : len(HOME_JOINTS)]
+        return moved.abs().amax(dim=1) * self.control_freq <= STILL_RAD_S
+
+    def draw(self, what: str) -> np.random.Generator:
+        """The episode's random numbers for ``what`` ("shape", "pose"), the same for the same seed."""
+        return np.random.default_rng([int(self._episode_seed[0]), *what.encode()])
 
     def _get_obs_extra(self, info: dict) -> dict:
         return {"tcp_pose": self.agent.tcp.pose.raw_pose}

@@ -12,3 +12,8 @@ def downward(x: float, y: float, z: float, yaw: float = 0.0) -> FloatArray:
     """Tool at ``(x, y, z)`` m pointing straight down; at ``yaw`` 0 rad the fingers open along the world's y."""
     rotation = Rotation.from_euler("z", yaw).as_matrix() @ np.diag([1.0, -1.0, -1.0])
     return make_pose(rotation, (x, y, z))
+
+
+def facing(x: float, y: float, yaw: float) -> FloatArray:
+    """Frame on the table at ``(x, y)`` m, turned by ``yaw`` rad; at 0 its -x axis points to the robot."""
+    return make_pose(Rotation.from_euler("z", yaw).as_matrix(), (x, y, 0.0))

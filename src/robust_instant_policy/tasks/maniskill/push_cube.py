@@ -9,7 +9,6 @@ import sapien
 import torch
 from mani_skill.utils.building import actors
 from mani_skill.utils.registration import register_env
-from mani_skill.utils.structs.pose import Pose
 
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.demonstrator import Stroke
@@ -55,13 +54,10 @@ class PushCubeEnv(CellEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
-        position = torch.zeros((len(env_idx), 3))
-        position[:, :2] = (2 * torch.rand((len(env_idx), 2)) - 1) * CUBE_RANGE_M
-        position[:, 2] = CUBE_HALF_SIZE_M
-        self.cube.set_pose(Pose.create_from_pq(p=position, q=[1, 0, 0, 0]))
-        position = position + torch.tensor([GOAL_DISTANCE_M, 0.0, 0.0])
-        position[:, 2] = 1e-3
-        self.goal.set_pose(Pose.create_from_pq(p=position, q=[np.sqrt(0.5), 0, np.sqrt(0.5), 0]))
+        x, y = self.draw("pose").uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2)
+        self.cube.set_pose(sapien.Pose([x, y, CUBE_HALF_SIZE_M]))
+        flat = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]  # the disc's axis is its x axis
+        self.goal.set_pose(sapien.Pose([x + GOAL_DISTANCE_M, y, 1e-3], flat))
 
     def evaluate(self) -> dict:
         offset = self.cube.pose.p[:, :2] - self.goal.pose.p[:, :2]

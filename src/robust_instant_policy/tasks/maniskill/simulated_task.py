@@ -35,7 +35,7 @@ class TaskSpec:
     """What makes a task: its environment, what the person does in it, and why it failed, in words.
 
     ``expert(env, rng)`` sees the simulator's state, as a person sees the scene; ``verdict(env)`` returns the
-    reason of failure, or nothing after success.
+    reason of failure, or nothing after success. ``object_sets`` are the sets of objects to choose from, if any.
     """
 
     name: str
@@ -44,7 +44,7 @@ class TaskSpec:
     env_id: str
     expert: Expert
     verdict: Verdict
-    env_options: tuple[tuple[str, Any], ...] = ()
+    object_sets: tuple[str, ...] = ()
 
 
 class SimulatedTask:
@@ -55,11 +55,12 @@ class SimulatedTask:
     video_hz = VIDEO_HZ
     workspace = WORKSPACE
 
-    def __init__(self, spec: TaskSpec):
+    def __init__(self, spec: TaskSpec, objects: str):
         require_renderer()
         self.name, self.description, self.goal = spec.name, spec.description, spec.goal
         self._spec = spec
-        self._env = gymnasium.make(spec.env_id, obs_mode="none", reward_mode="none", **dict(spec.env_options))
+        options = {"objects": objects} if spec.object_sets else {}
+        self._env = gymnasium.make(spec.env_id, obs_mode="none", reward_mode="none", **options)
         self._cell: CellEnv = self._env.unwrapped
         self._kinematics = Kinematics(BASE_POSITION_M)
         self._seed: int | None = None

@@ -1,0 +1,67 @@
+"""Putting links together from boxes and cylinders that are seen and touched alike."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import sapien
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.tasks.maniskill.paint import Paint
+
+AXES = {"x": (1.0, 0.0, 0.0, 0.0), "y": (0.70710678, 0.0, 0.0, 0.70710678), "z": (0.70710678, 0.0, -0.70710678, 0.0)}
+WOOD_DENSITY = 600.0  # kg/m³
+
+
+def add_box(
+    builder: Any, size: ArrayLike, centre: ArrayLike, paint: Paint, *, collide: bool = True, yaw: float = 0.0
+) -> None:
+    """A box of ``size (3,)`` m around ``centre (3,)`` m in the link's frame, turned by ``yaw`` rad about z."""
+    half = np.asarray(size, dtype=np.float64) / 2
+    pose = sapien.Pose(centre, [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+    seed = int(1e4 * abs(half.sum() + np.abs(centre).sum()))
+    builder.add_box_visual(pose, half, paint.material(seed))
+    if collide:
+        builder.add_box_collision(pose, half, density=WOOD_DENSITY)
+
+
+def add_cylinder(
+    builder: Any,
+    radius: float,
+    length: float,
+    centre: ArrayLike,
+    axis: str | ArrayLike,
+    paint: Paint,
+    *,
+    collide: bool = True,
+) -> None:
+    """A cylinder around ``centre (3,)`` along ``axis``: ``"x"``, ``"y"``, ``"z"`` or a direction ``(3,)``."""
+    pose = sapien.Pose(centre, AXES[axis] if isinstance(axis, str) else _turn_x_to(np.asarray(axis)))
+    builder.add_cylinder_visual(pose, radius, length / 2, paint.material())
+    if collide:
+        builder.add_cylinder_collision(pose, radius, length / 2, density=WOOD_DENSITY)
+
+
+def add_ball(builder: Any, radius: float, centre: ArrayLike, paint: Paint, *, collide: bool = True) -> None:
+    """A sphere around ``centre (3,)``."""
+    builder.add_sphere_visual(sapien.Pose(centre), radius, paint.material())
+    if collide:
+        builder.add_sphere_collision(sapien.Pose(centre), radius, density=WOOD_DENSITY)
+
+
+def hinge(builder: Any, kind: str, at: ArrayLike, axis: ArrayLike, limits: tuple[float, float]) -> None:
+    """Hang the link on its parent: ``kind`` ``"revolute"`` about, or ``"prismatic"`` along, ``axis (3,)`` at ``at``.
+
+    The link's own frame is that of its parent moved to ``at (3,)``.
+    """
+    turn = _turn_x_to(np.asarray(axis, dtype=np.float64))
+    builder.set_joint_properties(kind, [list(limits)], sapien.Pose(at, turn), sapien.Pose([0, 0, 0], turn))
+
+
+def _turn_x_to(direction: np.ndarray) -> list[float]:
+    """Quaternion (w, x, y, z) that turns the x axis to ``direction (3,)``."""
+    turned, _ = Rotation.align_vectors(direction[None] / np.linalg.norm(direction), [[1.0, 0.0, 0.0]])
+    x, y, z, w = turned.as_quat()
+    return [w, x, y, z]

@@ -1,0 +1,62 @@
+"""How surfaces look: plain paint, metal, wood grain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import sapien.render
+from numpy.typing import NDArray
+
+Color = tuple[float, float, float]
+
+GRAIN_PIXELS = 128
+GRAIN_LINES = 9  # across a face
+GRAIN_CONTRAST = 0.16
+
+
+@dataclass(frozen=True)
+class Paint:
+    """``color`` in sRGB, each 0 to 1; ``grain`` draws wood fibres along the faces' length."""
+
+    color: Color
+    roughness: float = 0.6
+    metallic: float = 0.0
+    grain: bool = False
+
+    def material(self, seed: int = 0) -> sapien.render.RenderMaterial:
+        """A material of this paint; ``seed`` chooses the piece of wood."""
+        material = sapien.render.RenderMaterial()
+        material.roughness, material.metallic, material.specular = self.roughness, self.metallic, 0.3
+        if self.grain:
+            material.base_color = [1.0, 1.0, 1.0, 1.0]
+            material.base_color_texture = texture(wood(self.color, np.random.default_rng(seed)))
+        else:
+            material.base_color = [*(channel**2.2 for channel in self.color), 1.0]
+        return material
+
+
+def texture(image: NDArray[np.uint8]) -> sapien.render.RenderTexture2D:
+    """A texture from an sRGB ``image (H, W, 3)``."""
+    opaque = np.full((*image.shape[:2], 1), 255, dtype=np.uint8)
+    return sapien.render.RenderTexture2D(np.concatenate([image, opaque], axis=2), "R8G8B8A8Unorm", srgb=True)
+
+
+def wood(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Fibres along the image's rows, as they run in a sawn board."""
+    down = np.linspace(0.0, 1.0, GRAIN_PIXELS)[:, None]
+    along = np.linspace(0.0, 1.0, GRAIN_PIXELS)[None]
+    bend = 0.04 * np.sin(2 * np.pi * (along * rng.uniform(0.5, 1.5) + rng.random()))
+    fibres = np.zeros((GRAIN_PIXELS, GRAIN_PIXELS))
+    for octave in (1.0, 2.3, 5.1):
+        fibres += np.sin(2 * np.pi * (GRAIN_LINES * octave * (down + bend) + rng.random())) / octave
+    fibres += 0.5 * np.repeat(rng.normal(0.0, 1.0, (GRAIN_PIXELS, 1)), GRAIN_PIXELS, axis=1)
+    shade = 1.0 + GRAIN_CONTRAST * fibres / np.abs(fibres).max()
+    return (np.clip(np.array(color) * shade[..., None], 0.0, 1.0) * 255).astype(np.uint8)
+
+
+WHITE = Paint((0.93, 0.92, 0.89))
+STEEL = Paint((0.78, 0.79, 0.81), roughness=0.35, metallic=0.35)
+BRASS = Paint((0.80, 0.62, 0.25), roughness=0.35, metallic=0.35)
+BLACK = Paint((0.08, 0.08, 0.09), roughness=0.5)
+RED = Paint((0.78, 0.12, 0.10), roughness=0.4)

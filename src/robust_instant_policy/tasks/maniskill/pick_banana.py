@@ -1,0 +1,106 @@
+"""Pick a banana from the table and hold it up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import sapien
+import sapien.physx
+import sapien.render
+import torch
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs.actor import Actor
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.tasks.maniskill.banana import Banana
+from robust_instant_policy.tasks.maniskill.cell import CellEnv
+from robust_instant_policy.tasks.maniskill.demonstrator import Stroke
+from robust_instant_policy.tasks.maniskill.paint import texture
+from robust_instant_policy.tasks.maniskill.poses import downward
+from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
+
+X_RANGE_M, Y_RANGE_M = (-0.08, 0.16), (-0.15, 0.15)
+YAW_RANGE_RAD = np.deg2rad(30)
+DENSITY = 650.0  # kg/m³: its capsules overlap
+SKIN_FRICTION = 0.8
+
+LIFTED_M = 0.05
+
+GRASP_HEIGHT_M = 0.007  # of the fingertips over the table
+ABOVE_M = 0.12
+LIFT_M = 0.16
+
+
+@register_env("RIP-PickBanana-v1", max_episode_steps=600)
+class PickBananaEnv(CellEnv):
+    """Success: the banana is off the table between both fingers, and the arm is still."""
+
+    banana: Actor
+    shape: Banana
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        self.shape = Banana.draw(self.draw("shape"))
+        builder = self.scene.create_actor_builder()
+        friction = sapien.physx.PhysxMaterial(SKIN_FRICTION, SKIN_FRICTION, 0.0)
+        for start, stop, radius in self.shape.capsules():
+            turn = Rotation.align_vectors((stop - start)[None], [[1.0, 0.0, 0.0]])[0].as_quat()[[3, 0, 1, 2]]
+            builder.add_capsule_collision(
+                sapien.Pose((start + stop) / 2, turn),
+                radius,
+                float(np.linalg.norm(stop - start)) / 2,
+                material=friction,
+                density=DENSITY,
+            )
+        skin = sapien.render.RenderMaterial()
+        skin.base_color, skin.roughness, skin.specular = [1.0, 1.0, 1.0, 1.0], 0.55, 0.3
+        skin.base_color_texture = texture(self.shape.skin())
+        builder._procedural_shapes.append(sapien.render.RenderShapeTriangleMesh(*self.shape.mesh(), skin))
+        builder.initial_pose = sapien.Pose([0, 0, self.shape.radius])
+        self.banana = builder.build(name="banana")
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        super()._initialize_episode(env_idx, options)
+        rng = self.draw("pose")
+        x, y = rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M)
+        yaw = rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD)
+        self.banana.set_pose(sapien.Pose([x, y, self.shape.radius], [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
+
+    def evaluate(self) -> dict:
+        lifted = self.banana.pose.p[:, 2] > self.shape.radius + LIFTED_M
+        held = self.agent.is_grasping(self.banana)
+        return {"success": lifted & held & self.arm_is_still(), "lifted": lifted, "held": held}
+
+
+def pick(env: PickBananaEnv, rng: np.random.Generator) -> list[Stroke]:
+    """Come down over the middle, fingers across the fruit, close, lift and hold."""
+    pose = env.banana.pose.to_transformation_matrix()[0].numpy()
+    x, y = pose[:2, 3].tolist()
+    yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
+    lift = LIFT_M + rng.uniform(-0.02, 0.02)
+    return [
+        Stroke(np.array([downward(x, y, ABOVE_M, yaw)]), closed=False, speed=0.35, error=0.005),
+        Stroke(np.array([downward(x, y, GRASP_HEIGHT_M, yaw)]), closed=True, speed=0.14, error=0.0015),
+        Stroke(np.array([downward(x, y, lift, yaw)]), closed=True, speed=0.16, error=0.005),
+    ]
+
+
+def verdict(env: PickBananaEnv) -> str:
+    """Why the task failed, or nothing."""
+    state: dict[str, Any] = env.evaluate()
+    if bool(state["success"]):
+        return ""
+    if not bool(state["held"]):
+        return "the banana slipped out of the fingers" if bool(state["lifted"]) else "the fingers hold no banana"
+    return "the banana is held but still moving" if bool(state["lifted"]) else "the banana was not lifted"
+
+
+SPEC = TaskSpec(
+    name="pick-banana",
+    description="pick the banana from the table",
+    goal="the banana is held above the table",
+    env_id="RIP-PickBanana-v1",
+    expert=pick,
+    verdict=verdict,
+)
