@@ -21,7 +21,8 @@ GRIPPER = GripperTriangle(length=0.10, opening=0.08)
 NUMBER_NOISE_M = 0.002  # of every number by itself: what a model that writes millimetres gets wrong
 STEP_NOISE_M, STEP_NOISE_RAD = 0.0015, 0.01  # of the whole gripper, step by step
 SLOW_NOISE_M = 0.001  # of the whole candidate, wandering along it
-NOTICEABLE_M = 0.02  # a contamination that moves no point this far is drawn again: nobody would call it hallucinated
+NOTICEABLE_M = 0.015  # a contamination that moves no point this far is drawn again: nobody would call it hallucinated
+DETOUR_M = (0.06, 0.20)  # between neighbouring ways of a task that can be done in several
 RAGGED_SHARE = 0.25  # of the scenes, whose candidates have 27 to 33 steps instead of 30
 
 Motion = Callable[[FloatArray], FloatArray]  # times (T,) -> actions (T, 10)
@@ -33,6 +34,7 @@ class Scene:
     candidates: list[FloatArray]
     hallucinated: np.ndarray
     modes: np.ndarray
+    ways: tuple[Motion, ...]
 
     @property
     def times(self) -> FloatArray:
@@ -130,7 +132,7 @@ def _noisy(rng: np.random.Generator, actions: FloatArray, level: float) -> Float
 
 def _offset(rng: np.random.Generator, truth: Motion, times: FloatArray, other: Motion) -> FloatArray:
     actions = truth(times)
-    actions[:, :9] += np.tile(_direction(rng) * rng.uniform(0.03, 0.15), 3)
+    actions[:, :9] += np.tile(_direction(rng) * rng.uniform(0.02, 0.15), 3)
     return actions
 
 
@@ -188,12 +190,42 @@ KINDS = {
 }
 
 
+def draw_modes(seed: int, style: str, sizes: tuple[int, ...]) -> Scene:
+    """A scene with ``sizes`` candidates in each of several good ways, which part and meet again; `Scene.truth` is the
+    way of the first and largest, ``modes`` the way of each candidate."""
+    rng = np.random.default_rng([seed, *sizes, len(style)])
+    task = Task.draw(rng, style)
+    common = task.at(_objects(rng))
+    start, stop = rng.uniform(0.1, 0.3), rng.uniform(0.6, 0.9)
+    around = rng.uniform(0, 2 * np.pi) + np.arange(len(sizes)) * 2 * np.pi / len(sizes)
+    detour = rng.uniform(*DETOUR_M) / (2 * np.sin(np.pi / max(len(sizes), 2)))  # neighbouring ways are this far apart
+    level = float(np.exp(rng.normal(0, 0.5)))
+    truths = [_detour(common, start, stop, [detour * np.cos(a), 0.0, detour * np.sin(a)], style) for a in around]
+    if len(sizes) == 1:
+        truths = [common]
+    modes = rng.permutation(np.repeat(np.arange(len(sizes)), sizes))
+    times = np.linspace(0.0, 1.0, STEPS)
+    candidates = [_noisy(rng, truths[mode](times), level) for mode in modes]
+    return Scene(truths[0], candidates, np.zeros(len(modes), dtype=bool), modes, tuple(truths))
+
+
+def _detour(common: Motion, start: float, stop: float, far: list[float], style: str) -> Motion:
+    def motion(times: FloatArray) -> FloatArray:
+        phase = np.clip((times - start) / (stop - start), 0.0, 1.0)
+        height = np.sin(np.pi * phase) ** 2 if style == "smooth" else np.minimum(1.0, 3 * np.minimum(phase, 1 - phase))
+        actions = common(times)
+        actions[:, :9] += np.outer(height, np.tile(far, 3))
+        return actions
+
+    return motion
+
+
 def draw_scene(seed: int, style: str, num_candidates: int, num_hallucinated: int, kind: str = "offset") -> Scene:
     """A scene of ``style`` "smooth" or "piecewise" with ``num_hallucinated`` candidates of one ``kind``."""
     rng = np.random.default_rng([seed, num_candidates, num_hallucinated, sorted(KINDS).index(kind), len(style)])
     task = Task.draw(rng, style)
     truth = task.at(_objects(rng))
-    level = float(np.exp(rng.normal(0, 0.3)))
+    level = float(np.exp(rng.normal(0, 0.5)))
     ragged = rng.random() < RAGGED_SHARE
     hallucinated = np.zeros(num_candidates, dtype=bool)
     hallucinated[rng.permutation(num_candidates)[:num_hallucinated]] = True
@@ -209,4 +241,4 @@ def draw_scene(seed: int, style: str, num_candidates: int, num_hallucinated: int
             if moved.max() > NOTICEABLE_M:
                 break
         candidates.append(_noisy(rng, actions, level))
-    return Scene(truth, candidates, hallucinated, np.zeros(num_candidates, dtype=np.intp))
+    return Scene(truth, candidates, hallucinated, np.zeros(num_candidates, dtype=np.intp), (truth,))

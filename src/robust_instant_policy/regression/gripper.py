@@ -11,15 +11,17 @@ from numpy.typing import ArrayLike
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.regression.alignment import Candidates
-from robust_instant_policy.regression.diagnosis import diagnose
+from robust_instant_policy.regression.diagnosis import confidence, judge, scaled_residuals
 from robust_instant_policy.regression.mixture import StudentTMixture
 from robust_instant_policy.regression.network import StudentTNetwork
 from robust_instant_policy.regression.student_t import DEFAULT_DOF, StudentTRegression
+from robust_instant_policy.regression.switching import persistent
 
 ARM_DIM = 10  # palm xyz, two fingertips xyz, gripper state
 POINT_DIM = 9
-SWITCH_COST = 0.5  # of all votes at one step: a change of state must be worth more, so that a blip of one step is not
-TOLERANCE_M = 0.015  # a gripper this far off still grasps: what `confidence` is about
+SWITCH_COST = 0.55  # votes, of all at one step, that a change of state must win: a blip of one step never does
+STATE_SCALE = 1 / 7  # a gripper state wrong for four steps is a hallucination, for fewer it is a matter of timing
+TOLERANCE_M = 0.015  # a gripper this far off still grasps
 ESTIMATORS = ("em", "network", "mixture", "median")
 
 
@@ -28,19 +30,20 @@ class RobustTrajectory:
     """What Q candidates for A arms agree on.
 
     ``actions (T, 10·A)`` is a rigid gripper at every step (lengths exact) with state 0 or 1; ``times (T,)`` in [0, 1];
-    ``scale (T, 10·A)`` the spread of trustworthy candidates about it; ``weights (Q, T)`` in [0, 1], low = ignored.
-    ``hallucinated (Q,)``, ``onset (Q,)`` (the candidate's own step, -1 if not hallucinated), ``dimensions`` and
-    ``scores (Q,)`` are the diagnosis; ``confidence`` in [0, 1] is how sure the trajectory is at its least sure step.
+    ``scale (T, 10·A)`` is the spread of trustworthy candidates about it, of the state the share that disagrees;
+    ``weights (Q, T)`` in [0, 1], low = ignored. ``scores (Q,)``, ``hallucinated (Q,)``, ``onset (Q,)`` (the candidate's
+    own step, -1 if it is not hallucinated) and ``dimensions`` are its diagnosis. ``confidence`` in [0, 1] is how
+    probably every point lies within ``tolerance`` of the truth, at the step where that is least so.
     """
 
     actions: FloatArray
     times: FloatArray
     scale: FloatArray
     weights: FloatArray
+    scores: FloatArray
     hallucinated: np.ndarray
     onset: np.ndarray
     dimensions: tuple[tuple[int, ...], ...]
-    scores: FloatArray
     confidence: float
 
 
@@ -52,88 +55,91 @@ def robust_gripper_trajectory(
     num_steps: int | None = None,
     seed: int = 0,
     triangle: GripperTriangle | None = None,
+    tolerance: float = TOLERANCE_M,
 ) -> RobustTrajectory:
     """The robust gripper trajectory of ``candidates``, each ``(T_q, 10·A)``: palm, two fingertips (m), state, per arm.
 
-    ``dof`` = inf is the Gaussian ablation (the mean of the candidates). ``times`` are the candidates' own, within
-    [0, 1], evenly spread by default; the result has ``num_steps`` steps, by default the median of the candidates'.
-    ``triangle`` is the gripper, by default measured from the candidates.
+    ``estimator`` is "em", "network" (the paper's), "mixture" (one whole way of several) or "median" (of each number at
+    each step, as a reference); ``dof`` = inf is the Gaussian ablation, the mean of the candidates. ``times`` are the
+    candidates' own, within [0, 1], evenly spread by default; the result has ``num_steps`` steps, by default the median
+    of the candidates'. ``triangle`` is the gripper, by default measured from the candidates. ``seed`` is the
+    network's. ``tolerance``, metres, is what `RobustTrajectory.confidence` is about.
     """
     if estimator not in ESTIMATORS:
         raise UnknownNameError("estimator", estimator, ESTIMATORS)
     data = Candidates.from_arrays(candidates, times)
     if data.num_dimensions % ARM_DIM:
-        raise InvalidValueError(f"candidates must be (T_q, {ARM_DIM}·A), got {data.num_dimensions} dimensions")
+        raise InvalidValueError(
+            f"candidates must be (T_q, {ARM_DIM}·A), got shape {data.values[: data.starts[1]].shape} for the first"
+        )
     count = int(np.median(data.lengths)) if num_steps is None else num_steps
     if count < 1:
         raise InvalidValueError(f"num_steps must be at least 1, got {num_steps}")
     at = np.linspace(0.0, 1.0, count)
     is_state = np.arange(data.num_dimensions) % ARM_DIM == POINT_DIM
-    points = data.values[:, ~is_state]
-    rows, clocks = data.split(points), data.split(data.times)
-    groups = np.zeros(points.shape[1])
-    fit: StudentTRegression | StudentTNetwork | StudentTMixture
-    if estimator == "network":
-        fit = StudentTNetwork(dof=dof, seed=seed).fit(rows, clocks)
-    elif estimator == "mixture":
-        fit = StudentTMixture(dof=dof, groups=groups).fit(rows, clocks)
-    else:
-        fit = StudentTRegression(dof=dof, groups=groups).fit(rows, clocks)
-    mean, scale = fit.mean(at), fit.scale(at)
-    if estimator == "median":
-        mean = np.median(Candidates.from_arrays(rows, clocks).at(at), axis=0)
+    points = Candidates(data.values[:, ~is_state], data.times, data.starts)
+    fit, residuals = _fit_points(points, dof, estimator, seed)
+    clocks = data.split(data.times)
     weights = np.stack([np.interp(at, clock, weight) for clock, weight in zip(clocks, fit.weights, strict=True)])
-    verdict = diagnose([(row - fit.mean(clock)) / fit.scale(clock) for row, clock in zip(rows, clocks, strict=True)])
-    actions = np.empty((count, data.num_dimensions))
-    spread = np.empty_like(actions)
-    held = data.split(data.values)
-    for arm in range(data.num_dimensions // ARM_DIM):
-        place = slice(arm * ARM_DIM, arm * ARM_DIM + POINT_DIM)
+
+    actions, scale = np.empty((count, data.num_dimensions)), np.empty((count, data.num_dimensions))
+    mean = np.median(points.at(at), axis=0) if estimator == "median" else fit.mean(at)
+    scale[:, ~is_state] = fit.scale(at)
+    shown = np.zeros_like(data.values)
+    shown[:, ~is_state] = residuals
+    for arm, column in enumerate(np.flatnonzero(is_state)):
+        place = slice(column - POINT_DIM, column)
         triplets = mean[:, arm * POINT_DIM : (arm + 1) * POINT_DIM].reshape(count, 3, 3)
         known = triangle or GripperTriangle.from_triplets(data.values[:, place].reshape(-1, 3, 3))
         actions[:, place] = known.triplets(known.poses(triplets)).reshape(count, POINT_DIM)
-        spread[:, place] = scale[:, arm * POINT_DIM : (arm + 1) * POINT_DIM]
-        votes = np.stack(
-            [_held(clock, block[:, place.stop] > 0.5, at) for clock, block in zip(clocks, held, strict=True)]
-        )
-        actions[:, place.stop] = steady_state(votes, weights)
-        spread[:, place.stop] = np.abs(votes - actions[:, place.stop]).mean(axis=0)
-    error = spread[:, ~is_state].max(axis=1) / np.sqrt(np.maximum(weights.sum(axis=0), 1.0))
-    support = np.minimum(1.0, 2 * weights.mean(axis=0)) if len(data) > 1 else np.zeros(count)
-    confidence = float((support * np.exp(-0.5 * (error / TOLERANCE_M) ** 2)).min())
+        closed = data.values[:, column] > 0.5
+        votes = np.stack([_held(c, state, at) for c, state in zip(clocks, data.split(closed), strict=True)])
+        state = steady_state(votes, weights)
+        actions[:, column] = state
+        scale[:, column] = (weights * (votes != state)).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-12)
+        shown[:, column] = (closed != _held(at, state, data.times)) / STATE_SCALE
+    verdict = judge(data.split(shown))
     return RobustTrajectory(
         actions,
         at,
-        spread,
+        scale,
         weights,
+        verdict.scores,
         verdict.hallucinated,
         verdict.onset,
         verdict.dimensions,
-        verdict.scores,
-        confidence,
+        confidence(fit.standard_error(at), weights, tolerance),
     )
 
 
-def steady_state(votes: np.ndarray, weights: FloatArray) -> FloatArray:
-    """Gripper state ``(T,)``, 0 or 1, closest to weighted ``votes (Q, T)`` with a cost for every change (Viterbi)."""
-    closed = (weights * votes).sum(axis=0)
-    total = weights.sum(axis=0)
-    cost = SWITCH_COST * float(total.mean())
-    gain = np.stack([total - closed, closed], axis=1)
-    best = gain[0]
-    came_from = np.zeros((len(gain), 2), dtype=np.intp)
-    for step in range(1, len(gain)):
-        switched = best[::-1] - cost > best
-        came_from[step] = np.where(switched, [1, 0], [0, 1])
-        best = gain[step] + np.where(switched, best[::-1] - cost, best)
-    state = np.empty(len(gain))
-    current = int(best[1] > best[0])
-    for step in range(len(gain) - 1, -1, -1):
-        state[step] = current
-        current = came_from[step, current]
-    return state
+def _fit_points(
+    points: Candidates, dof: float, estimator: str, seed: int
+) -> tuple[StudentTRegression | StudentTNetwork | StudentTMixture, FloatArray]:
+    """The fitted regression, and each candidate's residuals ``(N, D)`` about the way it goes."""
+    rows, clocks = points.split(points.values), points.split(points.times)
+    alike = np.zeros(points.num_dimensions)  # coordinates share one scale, so that the choice of axes does not matter
+    if estimator == "mixture":
+        mixture = StudentTMixture(dof, groups=alike).fit(rows, clocks)
+        own = np.maximum(mixture.labels, 0)[points.owners]
+        by_mode = [np.concatenate(scaled_residuals(mode, points)) for mode in mixture.modes]
+        return mixture, np.stack(by_mode)[own, np.arange(len(own))]
+    fit: StudentTRegression | StudentTNetwork
+    if estimator == "network":
+        fit = StudentTNetwork(dof, seed=seed).fit(rows, clocks)
+    else:
+        fit = StudentTRegression(dof, groups=alike).fit(rows, clocks)
+    return fit, np.concatenate(scaled_residuals(fit, points))
+
+
+def steady_state(votes: np.ndarray, weights: FloatArray) -> np.ndarray:
+    """Gripper state ``(T,)``, whether closed, that weighted ``votes (Q, T)`` elect, with a price on every change.
+
+    The price keeps the changes in their order and a blip of a single step out, even a unanimous one.
+    """
+    majority = np.where(votes, weights, -weights).sum(axis=0)
+    return persistent(majority, SWITCH_COST * float(weights.sum(axis=0).mean()))
 
 
 def _held(clock: FloatArray, state: np.ndarray, at: FloatArray) -> np.ndarray:
-    """The state ``(M,)`` at times ``at``, held from each sample until the next."""
-    return state[np.clip(np.searchsorted(clock, at + 1e-9, side="right") - 1, 0, len(state) - 1)]
+    """The state ``(M,)`` at times ``at``: that of the sample nearest in time."""
+    return state[np.searchsorted((clock[1:] + clock[:-1]) / 2, at)]

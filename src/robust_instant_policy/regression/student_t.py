@@ -28,6 +28,7 @@ from robust_instant_policy.errors import InvalidValueError, UnknownNameError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression.alignment import Candidates, checked_dof
 from robust_instant_policy.regression.basis import HatBasis, Roughness, multiply_banded, solve_banded
+from robust_instant_policy.regression.diagnosis import MIN_FREEDOM, effective_count, error_freedom
 from robust_instant_policy.regression.switching import persistent
 
 DEFAULT_DOF = 1.5  # the paper's ν
@@ -36,7 +37,7 @@ MAX_ITERATIONS = 200
 TOLERANCE = 1e-6  # log-likelihood gained per number: less in an iteration moves nothing that a robot could feel
 DRAFT_ITERATIONS = 6  # of the fit without smoothing from which outlying stretches are judged,
 REDRAFT_ITERATIONS = 3  # and more without those, from which the smoothing is
-SCALE_FLOOR = 1e-9  # of the data's extent: candidates that agree to the last digit still have a likelihood
+SCALE_FLOOR = 1e-3  # of a dimension's motion: models that write few digits often agree to the last one
 PRIOR_SAMPLES = 2.0  # candidates' worth of trust in the scale of all steps, against that of one step alone
 PAIRWISE_LIMIT = 4_000_000  # numbers compared pair by pair to find a start; beyond it there are enough for a median
 
@@ -47,10 +48,8 @@ LEFT_OUT = 1e-3  # weight of a sample in such a stretch; not 0, so that a step w
 STIFFNESSES = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0])  # prices on squared acceleration, in 1/σ²
 CORNER_DOF = 2.0  # accelerations are Student-t as well: most steps go straight, some turn sharply and stay sharp
 MIN_SLOPE = 0.2  # curvature of the likelihood, against w, that is still believed when errors are estimated
-MIN_FREEDOM = 0.25  # candidates beyond the first, at least, that errors are estimated from
 ALONE = 1.5  # effective candidates below which a step is decided by one, whose error nobody can see: it gets the scale
 POOLED_STEPS = 2  # neighbours on either side over which errors are averaged
-ERROR_FREEDOM = 4.0  # degrees of freedom per candidate of errors pooled over steps and dimensions; sets the coverage
 
 CORNER_SWEEPS = 2  # reweightings of the accelerations at each stiffness tried
 FAINT = 1e-6  # stiffness that only ties down knots between which no candidate has a sample
@@ -139,7 +138,7 @@ class StudentTRegression:
         if not 0 < level < 1:
             raise InvalidValueError(f"level must lie between 0 and 1, got {level} (a scalar, shape ())")
         error, deciding = self._error
-        freedom = ERROR_FREEDOM * np.maximum(deciding - 1, MIN_FREEDOM)
+        freedom = error_freedom(deciding)
         reach = self._evaluate(stdtrit(freedom, (1 + level) / 2)[:, None] * np.sqrt(error), times)
         mean = self.mean(times)
         return mean - reach, mean + reach
@@ -198,9 +197,9 @@ class _Model:
         blocks = self.data.at(self.basis.knots)
         median = np.median(blocks, axis=0)
         deviation = np.median(np.abs(blocks - median), axis=0)
-        extent = np.median(np.abs(median), axis=0) + np.median(deviation, axis=0) + 1e-100
-        self._floor = self.groups @ (SCALE_FLOOR * extent) ** 2
-        squared = self.groups @ np.median(1.5 * deviation, axis=0) ** 2 + self._floor
+        moved = np.ptp(median, axis=0) + np.finfo(float).eps * np.abs(median).max(axis=0) + 1e-100
+        self._floor = self.groups @ (SCALE_FLOOR * moved) ** 2
+        squared = self.groups @ (1.5 * deviation.mean(axis=0)) ** 2 + self._floor
         curve = median
         if np.isfinite(self.dof) and blocks.size * len(blocks) < PAIRWISE_LIMIT and len(blocks) > 1:
             gaps = ((blocks[:, None] - blocks[None]) ** 2 @ (1 / squared)) / len(squared)
@@ -317,7 +316,7 @@ class _Model:
         shared = len(state.squared_scale) * (self.data.lengths.mean() if self.unit == "trajectory" else 1)
         slope = 1 - 2 / shared * (weights @ (distance / (self.dof + distance))) / weights.sum()
         by_candidate = self.basis.project_each(weights, np.ones((len(weights), 1)))[:, :, 0]
-        deciding = by_candidate.sum(axis=1) ** 2 / (by_candidate**2).sum(axis=1)
+        deciding = effective_count(by_candidate.T)
         inflation = deciding / np.maximum(deciding - 1, MIN_FREEDOM) / max(slope, MIN_SLOPE) ** 2
 
         normal, pulls = self.pulls(state)
