@@ -81,6 +81,16 @@ class DescriptorMap:
         index = np.rint((np.asarray(pixels) - self.origin) / self.step).astype(np.intp)
         return np.clip(index[..., 1], 0, rows - 1) * cols + np.clip(index[..., 0], 0, cols - 1)
 
+    def around(self, pixels: ArrayLike) -> tuple[IntArray, FloatArray]:
+        """The four cells around each of ``pixels (n, 2)`` and their shares in bilinear interpolation, ``(n, 4)``."""
+        rows, cols = self.grid
+        place = np.clip((np.asarray(pixels) - self.origin) / self.step, 0, (cols - 1, rows - 1))
+        corner = np.minimum(place.astype(np.intp), (cols - 2, rows - 2))
+        right, down = (place - corner).T
+        cell = corner[:, 1] * cols + corner[:, 0]
+        shares = [(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right]
+        return np.stack([cell, cell + 1, cell + cols, cell + cols + 1], axis=1), np.stack(shares, axis=1)
+
     def shifted(self, cells: IntArray, row: int, col: int) -> IntArray:
         """The cells ``row`` down and ``col`` to the right of ``cells``, held at the border."""
         rows, cols = self.grid

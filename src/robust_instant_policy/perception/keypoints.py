@@ -13,7 +13,7 @@ from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError
 from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
 from robust_instant_policy.perception.cloud import Cloud, foreground
-from robust_instant_policy.perception.descriptors import DescriptorMap, Float32Array, IntArray
+from robust_instant_policy.perception.descriptors import NEIGHBOURS, DescriptorMap, Float32Array, IntArray
 from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.registration import painted, polish, proposals
 from robust_instant_policy.perception.settings import PAPER_SIMULATION, DescriptorSettings
@@ -23,6 +23,7 @@ MIN_OBJECT_POINTS = 25
 MAX_OBJECT_POINTS = 300
 MAX_PIECE_POINTS = 600
 MAX_OBJECT_CELLS = 80
+BEST_VIEWS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +46,8 @@ class _View:
     descriptors: DescriptorMap
     cloud: Cloud
     painted: Float32Array  # an even choice of the cloud's points with their colours
-    cells: IntArray  # cells with foreground in them
-    cell_points: FloatArray  # their mean points
+    cells: IntArray  # cells with foreground in them, then the cells around those
+    cell_points: FloatArray  # the mean points of the former
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +66,7 @@ class _Body:
     """What moves as one: points in the frame of the reference image, and the views that showed it."""
 
     points: FloatArray
-    colours: FloatArray
+    colours: Float32Array
     seen: list[tuple[_View, IntArray, FloatArray]]
 
     def find(self, view: _View) -> Registration:
@@ -73,7 +74,7 @@ class _Body:
             [other.descriptors.similarities(cells, view.descriptors, view.cells) for other, cells, _ in self.seen]
         )
         source = np.concatenate([points for _, _, points in self.seen])
-        motions = proposals(source, view.cell_points, similar)
+        motions = proposals(source, view.cell_points, similar[:, : len(view.cell_points)])
         return Registration(
             *polish(
                 motions,
@@ -84,15 +85,17 @@ class _Body:
         )
 
     def _agreement(self, motion: FloatArray, view: _View, similar: FloatArray) -> float:
-        """Mean similarity of the object's descriptors with those where ``motion`` puts them, best demonstration."""
-        moved = [transform_points(motion, points) for _, _, points in self.seen]
-        pixels = project(np.concatenate(moved), view.observation.intrinsics, view.observation.camera_pose)
-        column = np.full(view.descriptors.grid[0] * view.descriptors.grid[1], -1)
+        """Mean similarity of the object's descriptors with those where ``motion`` puts them, best demonstrations."""
+        points = transform_points(motion, np.concatenate([points for _, _, points in self.seen]))
+        pixels = project(points, view.observation.intrinsics, view.observation.camera_pose)
+        column = np.full(view.descriptors.grid[0] * view.descriptors.grid[1], len(view.cells))
         column[view.cells] = np.arange(len(view.cells))
-        where = column[view.descriptors.cells_at(pixels)]
-        value = np.where(where >= 0, np.take_along_axis(similar, where[:, None].clip(0), axis=1)[:, 0], 0)
-        ends = np.cumsum([len(points) for points in moved])[:-1]
-        return max(float(part.mean()) for part in np.split(value, ends))
+        padded = np.pad(similar, ((0, 0), (0, 1)))  # far from all foreground nothing agrees
+        cells, shares = view.descriptors.around(pixels)
+        value = (np.take_along_axis(padded, column[cells], axis=1) * shares).sum(axis=1)
+        ends = np.cumsum([len(points) for _, _, points in self.seen])[:-1]
+        means = sorted(float(part.mean()) for part in np.split(value, ends))
+        return float(np.mean(means[-BEST_VIEWS:]))
 
     def remember(self, view: _View, registration: Registration, seed: int) -> None:
         """Add the cells of ``view`` in which the object lies to what it is recognised by."""
@@ -192,6 +195,8 @@ class KeypointExtractor:
                 for piece in np.unique(cloud.pieces)
             ]
         )
+        around = np.unique([descriptors.shifted(cells, row, col) for row, col in NEIGHBOURS])
+        cells = np.concatenate([cells, np.setdiff1d(around, cells)])
         return _View(
             observation,
             descriptors,
@@ -206,7 +211,7 @@ class KeypointExtractor:
         reference = views[0]
         label = reference.cloud.pieces
         bodies, poses, best = [], [], 0.0
-        for piece in range(label.max() + 1):
+        for piece in np.unique(label):
             members = np.flatnonzero(label == piece)
             if len(members) < MIN_OBJECT_POINTS:
                 continue
@@ -214,11 +219,10 @@ class KeypointExtractor:
             body = _Body(reference.cloud.points[members], reference.cloud.colours[members], [])
             body.remember(reference, Registration(np.eye(4), 1.0, 1.0), self.seed)
             found: dict[int, Registration] = {0: Registration(np.eye(4), 1.0, 1.0)}
-            while len(found) < len(views):
-                tries = {i: body.find(view) for i, view in enumerate(views) if i not in found}
-                index = max(tries, key=lambda i: tries[i].fit)
-                found[index] = tries[index]
-                body.remember(views[index], tries[index], self.seed)
+            alone = {i: body.find(view) for i, view in enumerate(views) if i not in found}
+            for index in sorted(alone, key=lambda i: -alone[i].fit - alone[i].agreement):
+                found[index] = body.find(views[index])  # the surest first, so that they help with the others
+                body.remember(views[index], found[index], self.seed)
             worst = min(registration.fit for registration in found.values())
             best = max(best, worst)
             if worst >= MIN_FIT:

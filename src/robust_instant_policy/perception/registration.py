@@ -22,7 +22,10 @@ VOTE_SHARPNESS = 4  # power of the similarity with which a match votes
 COLOUR_SCALE_M = 0.06  # metres that count as much as the difference between black and white in one channel
 NEAR_M = 0.010  # residual at which a point counts about a third
 OWN_M = 0.04  # image points further from the object are not its own
-VARIANT_TURN = np.deg2rad(25)
+VARIANT_TURNS = np.deg2rad([0.0, -25.0, 25.0])
+SYMMETRY_TURNS = np.deg2rad([-20.0, -15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0])
+SYMMETRY_LOSS = 0.04  # of the fit; an object that loses less by these turns looks the same from all sides
+OPINION_SCALE = 0.01  # of the agreement; how much a worse turn counts
 COARSE_POINTS = 60
 FINALISTS = 3
 COARSE_REACH_M = (0.06, 0.05, 0.04, 0.03, 0.025, 0.02, 0.02, 0.02)
@@ -93,23 +96,33 @@ def polish(
     """The best of ``motions (P, 4, 4)`` after refinement, and its fit and agreement, both in [0, 1].
 
     ``source (N, 6)`` and ``target (M, 6)`` are points with their colours (see `painted`); ``agreement`` says how well
-    the descriptors agree with each of several motions. First all motions, and the same turned by `VARIANT_TURN`
-    either way, on a few points; then the best `FINALISTS` on all points.
+    the descriptors agree with each of several motions. First all motions, and the same turned by `VARIANT_TURNS`,
+    on a few points; then the best `FINALISTS` on all points.
     """
     middle = source[:, :3].mean(axis=0)
-    turned = [motions]
-    for angle in (-VARIANT_TURN, VARIANT_TURN):
-        variant = motions.copy()
-        variant[:, :3, :3] = turns_about_vertical(np.array(angle)) @ motions[:, :3, :3]
-        variant[:, :3, 3] += (motions[:, :3, :3] - variant[:, :3, :3]) @ middle
-        turned.append(variant)
+    tries = np.concatenate([turned(motion, middle, VARIANT_TURNS) for motion in motions])
     coarse = source[:: max(1, len(source) // COARSE_POINTS)], target[:: max(1, len(target) // (3 * COARSE_POINTS))]
-    motions, fits = closest_points(np.concatenate(turned), *coarse, COARSE_REACH_M)
-    leading = np.argsort(-fits - agreement(motions))[:FINALISTS]
-    motions, fits = closest_points(motions[leading], source, target, FINE_REACH_M)
-    agreements = agreement(motions)
+    tries, fits = closest_points(tries, *coarse, COARSE_REACH_M)
+    leading = np.argsort(-fits - agreement(tries))[:FINALISTS]
+    finalists, fits = closest_points(tries[leading], source, target, FINE_REACH_M)
+    agreements = agreement(finalists)
     best = int((fits + agreements).argmax())
-    return motions[best], float(fits[best]), float(agreements[best])
+    motion = finalists[best]
+    near = turned(motion, middle, SYMMETRY_TURNS)
+    if closest_points(near, source, target, ())[1].min() > fits[best] - SYMMETRY_LOSS:
+        # Points alone cannot tell how a disc is turned; the descriptors' opinion is averaged.
+        opinion = agreement(near)
+        share = np.exp((opinion - opinion.max()) / OPINION_SCALE)
+        motion = turned(motion, middle, np.atleast_1d(share @ SYMMETRY_TURNS / share.sum()))[0]
+    return motion, float(fits[best]), float(agreements[best])
+
+
+def turned(motion: FloatArray, middle: FloatArray, angles: FloatArray) -> FloatArray:
+    """``motion (4, 4)`` followed by upright turns by ``angles (A,)`` about ``middle (3,)``: ``(A, 4, 4)``."""
+    result = np.repeat(motion[None], len(angles), axis=0)
+    result[:, :3, :3] = turns_about_vertical(angles) @ motion[:3, :3]
+    result[:, :3, 3] += (motion[:3, :3] - result[:, :3, :3]) @ middle
+    return result
 
 
 def closest_points(
@@ -149,6 +162,6 @@ def closest_points(
     return motions, fits
 
 
-def painted(points: FloatArray, colours: FloatArray) -> Float32Array:
+def painted(points: FloatArray, colours: Float32Array) -> Float32Array:
     """Points with their colours ``(N, 6)``, all in metres."""
     return np.concatenate([points, colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
