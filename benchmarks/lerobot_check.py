@@ -103,7 +103,10 @@ def main() -> None:
         demos = options.demos or make_up(Path(scratch) / "demos")
         rows = [check(python, demos, backend, Path(scratch) / "frames.npz") for backend in ("pyav", "torchcodec")]
         back = check_import(python, Path(scratch))
-    text = table(rows) + f"\nThe other way round: {back}\n"
+    text = (
+        table(rows, options.demos.name if options.demos else f"{EPISODES} made-up episodes")
+        + f"\nThe other way round: {back}\n"
+    )
     print(text)
     TABLE.parent.mkdir(parents=True, exist_ok=True)
     TABLE.write_text(text)
@@ -230,9 +233,9 @@ def check_import(python: Path, scratch: Path) -> str:
     )
 
 
-def table(rows: list[dict[str, object]]) -> str:
+def table(rows: list[dict[str, object]], folder: str) -> str:
     lines = [
-        f"Written by `benchmarks/lerobot_check.py` ({LEROBOT.replace('==', ' ')}).",
+        f"Written by `benchmarks/lerobot_check.py`: {folder}, read with {LEROBOT.replace('==', ' ')} and with ours.",
         "",
         "| decoder | torch, torchvision | episodes | frames | images | largest mean difference of an image | result |",
         "| --- | --- | --- | --- | --- | --- | --- |",
