@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -39,7 +40,9 @@ def align(trajectories: Sequence[Trajectory]) -> AlignedDemonstrations:
     order, votes = Counter(orders).most_common(1)[0]
     if 2 * votes <= len(trajectories) and votes < len(trajectories):
         length = round(float(np.median([len(trajectory) for trajectory in trajectories])))
-        even = [trajectory.resampled(np.linspace(0, 1, length)).actions for trajectory in _from_zero_to_one(trajectories)]
+        even = [
+            trajectory.resampled(np.linspace(0, 1, length)).actions for trajectory in _from_zero_to_one(trajectories)
+        ]
         return AlignedDemonstrations(np.stack(even), tuple(range(len(trajectories))), (0, length - 1))
 
     kept = tuple(index for index, own in enumerate(orders) if own == order)
@@ -67,7 +70,7 @@ def _stretches(trajectory: Trajectory) -> list[tuple[tuple[int, ...], int, int]]
     """Runs of equal gripper state: (state of each arm, first step, step after the last)."""
     states = [tuple(int(value > 0.5) for value in row) for row in trajectory.gripper_state]
     edges = [0, *(step for step in range(1, len(states)) if states[step] != states[step - 1]), len(states)]
-    return [(states[start], start, stop) for start, stop in zip(edges[:-1], edges[1:], strict=True)]
+    return [(states[start], start, stop) for start, stop in pairwise(edges)]
 
 
 def _stretched(actions: FloatArray, length: int) -> FloatArray:

@@ -32,7 +32,7 @@ def write_row(numbers: Sequence[int] | np.ndarray) -> str:
 
 def row_grammar(digits: Sequence[int]) -> str:
     """GBNF for one line of integers; the j-th has up to ``digits[j]`` digits."""
-    return 'root ::= ' + ' " " '.join(f'"-"? [0-9]{{1,{count}}}' for count in digits) + ' "\\n"'
+    return "root ::= " + ' " " '.join(f'"-"? [0-9]{{1,{count}}}' for count in digits) + ' "\\n"'
 
 
 def row_pattern(digits: Sequence[int]) -> str:

@@ -36,8 +36,8 @@ class Frame:
     """A coordinate system that can be found in any scene from its keypoints ``(K, 3)``.
 
     ``world`` is the world itself; ``keypoint`` keeps the world's axes with its origin at the keypoint; ``upright``
-    also turns about the vertical with the keypoints ``members``, ``rigid`` in all directions. ``shape (N, 3)`` are the members'
-    places in the frame.
+    also turns about the vertical with the keypoints ``members``, ``rigid`` in all directions. ``shape (N, 3)`` are
+    the members' places in the frame.
     """
 
     kind: Kind
@@ -118,7 +118,11 @@ def candidate_frames(keypoints: FloatArray) -> list[Frame]:
     closeness = np.median(distances, axis=0)
     groups: dict[tuple[int, ...], None] = {}
     for k in range(num_points):
-        together = [j for j in range(num_points) if j == k or varies[k, j] < RIGID_SPREAD_M] if num_demos > 2 else range(num_points)
+        together = (
+            [j for j in range(num_points) if j == k or varies[k, j] < RIGID_SPREAD_M]
+            if num_demos > 2
+            else range(num_points)
+        )
         near = sorted(together, key=lambda j: closeness[k, j])
         for size in {2, 3, 5, len(near)}:
             if 2 <= size <= len(near):

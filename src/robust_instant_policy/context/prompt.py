@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -26,7 +27,9 @@ from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 AGREE_MM = 1.0  # a number on which all demonstrations agree this closely is not asked for
 MIN_DEMOS_TO_AGREE = 3
-INPUTS_PER_STEP = 3  # keypoint coordinates shown with each step
+INPUTS_PER_QUERY = 2  # keypoint coordinates shown with each example
+NOISE_MM = 5.0  # variation of a coordinate that says nothing
+STEPS_PER_QUERY = 3  # neighbouring steps asked for together
 TOKENS_PER_NUMBER = 6  # upper bound for a number with its separator
 REACH_MM = 5000.0  # numbers beyond this are no place a robot can go
 
@@ -40,11 +43,15 @@ Frames = Literal["world", "adaptive"]
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
-    """What one step asks for: ``asked`` of its numbers vary, the others are those of ``centre`` (mm)."""
+class _Question:
+    """What one query asks: the numbers ``asked`` (step, dimension) of neighbouring steps written in one frame.
 
-    centre: FloatArray
-    asked: tuple[int, ...]
+    ``digits`` bounds the length of each, ``inputs`` are the keypoint coordinates shown with it (in the frame of
+    ``step``), and ``examples`` is the text of the demonstrations.
+    """
+
+    step: int
+    asked: tuple[tuple[int, int], ...]
     digits: tuple[int, ...]
     inputs: tuple[int, ...]
     examples: str
@@ -101,8 +108,10 @@ class InContextPrompt:
                 for points, rows in zip(keypoints, numbers, strict=True)
             )
         else:
-            self._steps = [_plan_step(numbers[:, step], shown[:, step]) for step in range(actions.shape[1])]
-            self._queried = [step for step, plan in enumerate(self._steps) if plan.asked]
+            self._centre = np.round(np.median(numbers, axis=0))
+            blocks = _neighbours(self.frames_, STEPS_PER_QUERY)
+            questions = (_ask(steps, numbers - self._centre, shown) for steps in blocks)
+            self._questions = [question for question in questions if question.asked]
         return self
 
     def queries(self, keypoints: FloatArray) -> list[Query]:
@@ -112,24 +121,19 @@ class InContextPrompt:
             columns = ACTION_DIM * self._num_arms
             rows = max(self._lengths)
             text = self._prefix + _sequence_input(keypoints)
-            return [
-                Query(text, max_tokens=rows * columns * TOKENS_PER_NUMBER, stop=("\n\n",), instruction=INSTRUCTION)
-            ]
+            return [Query(text, max_tokens=rows * columns * TOKENS_PER_NUMBER, stop=("\n\n",), instruction=INSTRUCTION)]
         inputs = self._inputs(keypoints)
-        queries = []
-        for index in self._queried:
-            step = self._steps[index]
-            queries.append(
-                Query(
-                    step.examples + _shown(inputs[index], step.inputs),
-                    max_tokens=sum(step.digits) + 2 * len(step.digits) + 1,
-                    grammar=row_grammar(step.digits),
-                    pattern=row_pattern(step.digits),
-                    stop=("\n",),
-                    instruction=INSTRUCTION,
-                )
+        return [
+            Query(
+                question.examples + _shown(inputs[question.step], question.inputs),
+                max_tokens=sum(question.digits) + 2 * len(question.digits) + 1,
+                grammar=row_grammar(question.digits),
+                pattern=row_pattern(question.digits),
+                stop=("\n",),
+                instruction=INSTRUCTION,
             )
-        return queries
+            for question in self._questions
+        ]
 
     def accepts(self, query_index: int, text: str) -> bool:
         """Whether the answer ``text`` to a query can be read for certain."""
@@ -153,21 +157,22 @@ class InContextPrompt:
                 return Trajectory.from_actions(_from_world_rows(rows))
             total = self._lengths[0]
             return Trajectory(self._decode(keypoints, rows), np.linspace(0, 1, total)[: len(rows)])
-        rows = np.stack([step.centre for step in self._steps])
-        for index, offsets in zip(self._queried, parts, strict=True):
-            rows[index, list(self._steps[index].asked)] += offsets
+        rows = self._centre.copy()
+        for question, offsets in zip(self._questions, parts, strict=True):
+            for (step, dim), offset in zip(question.asked, offsets, strict=True):
+                rows[step, dim] += offset
         return Trajectory.from_actions(self._decode(keypoints, rows))
 
     def _read(self, query_index: int, text: str) -> FloatArray | None:
         if self.layout == "factorised":
-            step = self._steps[self._queried[query_index]]
+            question = self._questions[query_index]
             lines = [line for line in text.splitlines() if line.strip()]
-            numbers = read_row(lines[0], len(step.asked)) if lines else None
+            numbers = read_row(lines[0], len(question.asked)) if lines else None
             if numbers is None or np.abs(numbers).max() > REACH_MM:
                 return None
-            states = [n for n, dim in zip(numbers, step.asked, strict=True) if dim % ACTION_DIM == STATE_INDEX]
-            if any(state + step.centre[STATE_INDEX] not in (0, 1) for state in states):
-                return None
+            for (step, dim), number in zip(question.asked, numbers, strict=True):
+                if dim % ACTION_DIM == STATE_INDEX and number + self._centre[step, dim] not in (0, 1):
+                    return None
             return numbers
         rows = read_rows(text, ACTION_DIM * self._num_arms)
         if rows is None or np.abs(rows).max() > REACH_MM:
@@ -198,7 +203,8 @@ class InContextPrompt:
         return np.stack([known[id(frame)] for frame in self.frames_])
 
     def _encode(self, keypoints: FloatArray, actions: FloatArray) -> FloatArray:
-        """Numbers ``(T, 10·A)`` in millimetres in the steps' frames: tool centre, then palm and first fingertip from it."""
+        """Numbers ``(T, 10·A)``: in each step's frame, in millimetres, the point between the fingertips, then the palm
+        and the first fingertip as seen from it; the gripper's state."""
         rows = actions.reshape(len(actions), self._num_arms, ACTION_DIM).copy()
         for pose, row in zip(self._poses(keypoints), rows, strict=True):
             for arm in row:
@@ -230,30 +236,57 @@ class InContextPrompt:
         return keypoints
 
 
-def _plan_step(numbers: FloatArray, shown: FloatArray) -> _Step:
-    """Decide what a step asks, from the demonstrations' ``numbers (I, 10·A)`` and ``shown (I, 3·K)`` keypoints."""
-    centre = np.round(np.median(numbers, axis=0))
-    offsets = np.round(numbers - centre).astype(int)
-    reach = np.abs(offsets).max(axis=0)
-    varies = np.abs(numbers - np.median(numbers, axis=0)).max(axis=0) > AGREE_MM
-    state = np.arange(len(centre)) % ACTION_DIM == STATE_INDEX
-    varies = np.where(state, reach > 0, varies) if len(numbers) >= MIN_DEMOS_TO_AGREE else ~state
-    asked = tuple(int(dim) for dim in np.flatnonzero(varies))
-    digits = tuple(max(1, len(str(round(1.5 * reach[dim])))) for dim in asked)
-    inputs = _telling_inputs(shown, numbers[:, list(asked)]) if asked else ()
+def _neighbours(frames: Sequence[Frame], most: int) -> list[tuple[int, ...]]:
+    """Runs of at most ``most`` steps written in the same frame, of nearly equal length within each frame's run."""
+    starts = [0, *(step for step in range(1, len(frames)) if frames[step] is not frames[step - 1]), len(frames)]
+    blocks = []
+    for start, stop in pairwise(starts):
+        for part in np.array_split(np.arange(start, stop), -(-(stop - start) // most)):
+            blocks.append(tuple(int(step) for step in part))
+    return blocks
+
+
+def _ask(steps: Sequence[int], offsets: FloatArray, shown: FloatArray) -> _Question:
+    """The question about ``steps``, from the demonstrations' ``offsets (I, T, 10·A)`` from their median and the
+    ``shown (I, T, 3·K)`` keypoints, all in millimetres."""
+    whole = np.round(offsets).astype(int)
+    reach = np.abs(whole).max(axis=0)
+    is_state = np.arange(offsets.shape[2]) % ACTION_DIM == STATE_INDEX
+    if len(offsets) >= MIN_DEMOS_TO_AGREE:
+        varies = np.where(is_state, reach > 0, np.abs(offsets).max(axis=0) > AGREE_MM)
+    else:  # too few to tell what always stays the same
+        varies = np.broadcast_to(~is_state, reach.shape)
+    asked = tuple((step, int(dim)) for step in steps for dim in np.flatnonzero(varies[step]))
+    if not asked:
+        return _Question(steps[0], (), (), (), "")
+    rows = np.stack([whole[:, step, dim] for step, dim in asked], axis=1)
+    digits = tuple(max(1, len(str(round(1.5 * reach[step, dim])))) for step, dim in asked)
+    inputs = _telling_inputs(shown[:, steps[0]], rows)
     examples = "".join(
-        _shown(points, inputs) + write_row(row[list(asked)]) + "\n" for points, row in zip(shown, offsets, strict=True)
+        _shown(points, inputs) + write_row(row) + "\n" for points, row in zip(shown[:, steps[0]], rows, strict=True)
     )
-    return _Step(centre, asked, digits, inputs, examples)
+    return _Question(steps[0], asked, digits, inputs, examples)
 
 
 def _telling_inputs(shown: FloatArray, outputs: FloatArray) -> tuple[int, ...]:
-    """The keypoint coordinates that go along with the outputs most, over the demonstrations."""
-    a = shown - shown.mean(axis=0)
-    b = outputs - outputs.mean(axis=0)
-    scale = np.linalg.norm(a, axis=0) + MM * 0.01
-    strength = np.linalg.norm((a / scale).T @ b, axis=1)
-    return tuple(sorted(int(k) for k in np.argsort(-strength, kind="stable")[:INPUTS_PER_STEP]))
+    """The few of ``shown (I, 3·K)`` keypoint coordinates that tell most about the ``outputs (I, D)``.
+
+    One after the other the coordinate along which the outputs vary most together (orthogonal matching pursuit), so
+    that no two say the same.
+    """
+    inputs = shown - shown.mean(axis=0)
+    rest = outputs - outputs.mean(axis=0)
+    chosen: list[int] = []
+    for _ in range(min(INPUTS_PER_QUERY, shown.shape[1])):
+        scale = np.linalg.norm(inputs, axis=0) + NOISE_MM * np.sqrt(len(shown))
+        strength = np.linalg.norm((inputs / scale).T @ rest, axis=1)
+        strength[chosen] = -1.0
+        best = int(np.argmax(strength))
+        chosen.append(best)
+        along = inputs[:, best] / max(float(np.linalg.norm(inputs[:, best])), 1e-9)
+        rest = rest - np.outer(along, along @ rest)
+        inputs = inputs - np.outer(along, along @ inputs)
+    return tuple(sorted(chosen))
 
 
 def _shown(inputs: FloatArray, chosen: Sequence[int]) -> str:

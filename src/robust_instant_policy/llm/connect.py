@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 from urllib.parse import urlsplit
 
 from robust_instant_policy.errors import UsageError
@@ -10,6 +11,7 @@ from robust_instant_policy.llm.model import LanguageModel
 
 FORMS = "'embedded', 'gguf:PATH', 'openai:MODEL', 'http://HOST:PORT/v1#MODEL'"
 OPENAI_URL = "https://api.openai.com/v1"
+STYLES: tuple[Literal["chat", "completions"], ...] = ("chat", "completions")
 
 
 def connect(spec: str) -> LanguageModel:
@@ -36,8 +38,9 @@ def connect(spec: str) -> LanguageModel:
         from robust_instant_policy.llm.endpoint import Endpoint
 
         return Endpoint(OPENAI_URL, rest, style="chat")
-    style, _, address = spec.partition("+") if kind.endswith(("+http", "+https")) else ("", "", spec)
-    if style in ("", "chat", "completions") and address.startswith(("http://", "https://")):
+    forced = next((style for style in STYLES if spec.startswith(style + "+")), None)
+    address = spec if forced is None else spec.removeprefix(forced + "+")
+    if address.startswith(("http://", "https://")):
         from robust_instant_policy.llm.endpoint import Endpoint
 
         url, _, model = address.partition("#")
@@ -45,5 +48,5 @@ def connect(spec: str) -> LanguageModel:
             raise UsageError("a key does not belong into the address; put it into the variable OPENAI_API_KEY")
         if not urlsplit(url).hostname or not model:
             raise UsageError("an address needs its model behind a #, as in http://localhost:8000/v1#my-model")
-        return Endpoint(url, model, style=style or None)
+        return Endpoint(url, model, style=forced)
     raise UsageError(f"unknown language model {spec!r}; known forms: {FORMS}")

@@ -33,7 +33,12 @@ def cache_folder() -> Path:
 
 
 def load_embedded() -> LlamaModel:
-    """The embedded model; its file is made at the first use (2 s, 69 MB) and checked at every one.
+    """The embedded model, from the file of `embedded_path`."""
+    return LlamaModel(embedded_path(), NAME)
+
+
+def embedded_path() -> Path:
+    """The embedded model's file, made at the first use (2 s, 69 MB) and checked at every one.
 
     Raises `MissingExtraError` when the package is not installed and `ModelError` when its parts are not what they
     should be.
@@ -42,7 +47,7 @@ def load_embedded() -> LlamaModel:
     digest = path.with_suffix(".sha256")
     if not (path.exists() and digest.exists() and digest.read_text().strip() == _sha256(path)):
         _make(path, digest)
-    return LlamaModel(path, NAME)
+    return path
 
 
 def _make(path: Path, digest: Path) -> None:

@@ -292,7 +292,7 @@ def _longest(queries: Sequence[Query], count: int = 3) -> list[Query]:
 
 
 def _common_length(a: str, b: str) -> int:
-    return len(os.path.commonprefix([a, b]))
+    return next((place for place, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
 
 
 def _seed(seed: int, sample: int, attempt: int) -> int:

@@ -25,9 +25,14 @@ class LanguageModel(Protocol):
     not say. ``counts_exactly`` tells whether `count_tokens` is the model's own count or an estimate.
     """
 
-    name: str
-    context_length: int | None
-    counts_exactly: bool
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def context_length(self) -> int | None: ...
+
+    @property
+    def counts_exactly(self) -> bool: ...
 
     def count_tokens(self, text: str) -> int: ...
 

@@ -8,7 +8,7 @@ import json
 import sqlite3
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
@@ -141,7 +141,7 @@ class SampleStore:
             "WHERE model = ? AND query = ? AND settings = ? AND sample = ? ORDER BY attempt",
             (model, _digest(query), settings, sample),
         )
-        return [None if row[0] is None else Answer(*row, replayed=True) for row in rows]
+        return [None if row[0] is None else replace(Answer(*row), replayed=True) for row in rows]
 
     def _select(self, sql: str, values: Sequence[object] = ()) -> list[tuple]:
         with self._lock:
@@ -154,8 +154,14 @@ class RecordedModel:
     def __init__(self, model: LanguageModel, store: SampleStore):
         self._model, self._store = model, store
         self.name = model.name
-        self.context_length = model.context_length
-        self.counts_exactly = model.counts_exactly
+
+    @property
+    def context_length(self) -> int | None:
+        return self._model.context_length
+
+    @property
+    def counts_exactly(self) -> bool:
+        return self._model.counts_exactly
 
     def count_tokens(self, text: str) -> int:
         return self._model.count_tokens(text)

