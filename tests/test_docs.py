@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -45,6 +47,12 @@ def test_shell_blocks_hold_commands_that_exist(page):
                 assert words[1] == "-m" or (ROOT / words[1]).exists(), line
             else:
                 assert program in OTHER_PROGRAMS, line
+
+
+def test_result_tables_in_the_documentation_are_those_of_the_results_folder():
+    command = [sys.executable, str(ROOT / "scripts" / "include_results.py"), "--check"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

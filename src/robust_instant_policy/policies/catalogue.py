@@ -11,9 +11,14 @@ from robust_instant_policy.policies.kat import KeypointActionTokens
 from robust_instant_policy.policies.policy import Policy
 from robust_instant_policy.policies.rip import RobustInstantPolicy
 
+MOST_QUERIES = 10  # limit of the adaptive method, unless more are asked for
+
 _METHODS: dict[str, Callable[[InstantPolicy, int], Policy]] = {
     "rip": lambda instant, queries: RobustInstantPolicy(instant, num_queries=queries),
     "rip-gauss": lambda instant, queries: RobustInstantPolicy(instant, num_queries=queries, dof=math.inf),
+    "rip-adaptive": lambda instant, queries: RobustInstantPolicy(
+        instant, num_queries=max(queries, MOST_QUERIES), adaptive=True
+    ),
     "kat": lambda instant, queries: KeypointActionTokens(instant, num_queries=queries),
 }
 METHOD_NAMES = tuple(_METHODS)

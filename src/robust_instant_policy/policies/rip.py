@@ -42,7 +42,7 @@ class RobustInstantPolicy(KeypointActionTokens):
             raise UsageError(f"dof must be positive (or infinite), got {dof}")
         super().__init__(llm, num_queries=num_queries, **options)
         self.dof, self.estimator, self.adaptive = dof, estimator, adaptive
-        self.name = "rip-gauss" if math.isinf(dof) else "rip"
+        self.name = "rip-gauss" if math.isinf(dof) else "rip-adaptive" if adaptive else "rip"
 
     def plan(self, observation: Observation) -> Plan:
         """Raises `KeypointError` or `PlanningError` where no plan can be made."""
