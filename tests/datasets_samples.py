@@ -30,7 +30,7 @@ def demonstration(seed: int | None, steps: int = 40, arms: int = 1) -> Demonstra
     one_arm = Trajectory.from_poses(poses, np.arange(steps) > steps // 2, GripperTriangle(0.1, 0.08))
     trajectory = Trajectory.from_actions(np.tile(one_arm.actions, (1, arms)))
     return Demonstration(
-        observation(seed or 0), trajectory, RATE_HZ, TASK, seed, {"manner": "slow – calm", "pause": 0.3}
+        observation(seed or 0), trajectory, RATE_HZ, TASK, seed, {"manner": "slow – calm", "pause": np.float32(0.5)}
     )
 
 

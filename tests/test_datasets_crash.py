@@ -175,7 +175,7 @@ def test_an_interrupted_episode_leaves_the_writer_usable(tmp_path, monkeypatch):
     with DatasetWriter(tmp_path / "demos", TASK, DESCRIPTION, RATE_HZ) as writer:
         writer.add(demonstration(0))
         with monkeypatch.context() as patch:
-            patch.setattr(module, "_episode_table", interrupt)
+            patch.setattr(module, "episode_table", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 writer.add(demonstration(1))
         assert writer.num_episodes == 1

@@ -11,8 +11,6 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
@@ -24,14 +22,21 @@ from robust_instant_policy.datasets.files import (
     write_error,
     write_whole,
 )
-from robust_instant_policy.datasets.folder import STATISTICS_PREFIX, Folder, open_folder, read_json, read_table
+from robust_instant_policy.datasets.folder import Folder, open_folder, read_json
 from robust_instant_policy.datasets.images import encode_depth, encode_png
 from robust_instant_policy.datasets.statistics import Statistics, combine, feature_statistics, image_statistics
-from robust_instant_policy.datasets.video import PIXEL_FORMAT, encode_video
+from robust_instant_policy.datasets.tables import (
+    episode_table,
+    features_of,
+    frame_table,
+    listed,
+    parquet,
+    read_statistics,
+    task_table,
+)
+from robust_instant_policy.datasets.video import encode_video
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.trajectory import ACTION_DIM
 
 EVEN_TIMING_TOLERANCE = 1e-6  # of an episode's duration
 EPISODE_FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.(?:parquet|png|mp4)$")
@@ -50,7 +55,7 @@ class DatasetWriter:
 
     def __init__(self, path: str | Path, task: str, description: str, rate_hz: float):
         self.path = Path(path)
-        self.task, self.description, self.rate_hz = task, description, float(rate_hz)
+        self.task, self.description, self.rate_hz = task, description or task, float(rate_hz)
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise DatasetError(f"the recording rate must be positive, got {rate_hz} Hz")
         try:
@@ -99,6 +104,7 @@ class DatasetWriter:
 
     def discard(self, seed: int | None = None) -> None:
         """Remember that an attempt, of ``seed`` if it had one, was thrown away."""
+        self._require_open()
         self._write_own([*self._discarded_seeds, seed])
 
     def add(self, demonstration: Demonstration, images: NDArray[np.uint8] | None = None) -> None:
@@ -106,14 +112,17 @@ class DatasetWriter:
 
         When this returns, the episode is on the disk; when it raises, the folder is as it was before.
         """
-        if self._lock is None:
-            raise DatasetError(f"the writer of {self.path} is closed; open a new one to add episodes")
+        self._require_open()
         self._check(demonstration, images)
         try:
             self._folder, self._statistics = self._write_episode(demonstration, images)
         except BaseException:
             self._take_up()
             raise
+
+    def _require_open(self) -> None:
+        if self._lock is None:
+            raise DatasetError(f"the writer of {self.path} is closed; open a new one to go on")
 
     def _resume(self) -> None:
         """Take up what earlier writers finished, and remove what they did not."""
@@ -139,7 +148,7 @@ class DatasetWriter:
         if (self.path / layout.INFO_PATH).exists():
             self._folder = open_folder(self.path, self.task)
             for episode in range(self.num_episodes):
-                self._statistics = _combined(self._statistics, _read_statistics(self.path, episode))
+                self._statistics = _combined(self._statistics, read_statistics(self.path, episode))
         self._remove_unfinished(self.num_episodes)
 
     def _remove_unfinished(self, count: int) -> None:
@@ -186,7 +195,7 @@ class DatasetWriter:
         if self._folder is None:
             return
         features = self._folder.info["features"]
-        declared = _features(trajectory.num_arms, images, self.rate_hz)
+        declared = features_of(trajectory.num_arms, images, self.rate_hz)
         for key in sorted({*features, *declared}):
             old, new = (entry.get(key, {}).get("shape") for entry in (features, declared))
             if old != new:
@@ -228,10 +237,10 @@ class DatasetWriter:
             }
             statistics[layout.VIDEO_KEY] = image_statistics(images)
         row |= self._write_start(demonstration, episode)
-        self._write_file(layout.DATA_PATTERN, episode, _parquet(_frame_table(columns)))
-        self._write_file(layout.EPISODES_PATTERN, episode, _parquet(_episode_table(row, statistics)))
+        self._write_file(layout.DATA_PATTERN, episode, parquet(frame_table(columns)))
+        self._write_file(layout.EPISODES_PATTERN, episode, parquet(episode_table(row, statistics)))
         whole = _combined(self._statistics, statistics)
-        features = _features(demonstration.trajectory.num_arms, images, self.rate_hz)
+        features = features_of(demonstration.trajectory.num_arms, images, self.rate_hz)
         info = self._write_dataset(features, whole, episode + 1, first_frame + length)
         earlier = [] if self._folder is None else self._folder.episodes
         return Folder(self.path, info, [*earlier, row]), whole
@@ -260,7 +269,7 @@ class DatasetWriter:
             layout.CAMERA_POSE_COLUMN: observation.camera_pose.ravel().tolist(),
             layout.DEPTH_UNIT_COLUMN: unit,
             layout.SEED_COLUMN: demonstration.seed,
-            layout.INFO_COLUMN: json.dumps(dict(demonstration.info), sort_keys=True),
+            layout.INFO_COLUMN: json.dumps(dict(demonstration.info), sort_keys=True, default=_number),
         }
 
     def _write_dataset(
@@ -283,70 +292,13 @@ class DatasetWriter:
             "features": features,
         }
         if num_episodes == 1:
-            write_whole(self.path / layout.TASKS_PATH, _parquet(_task_table(self.description)))
-        write_whole(self.path / layout.STATS_PATH, _json({key: _listed(value) for key, value in statistics.items()}))
+            write_whole(self.path / layout.TASKS_PATH, parquet(task_table(self.description)))
+        write_whole(self.path / layout.STATS_PATH, _json({key: listed(value) for key, value in statistics.items()}))
         write_whole(self.path / layout.INFO_PATH, _json(info))
         return info
 
     def _write_file(self, pattern: str, episode: int, content: bytes) -> None:
         write_whole(self.path / layout.episode_path(pattern, episode), content)
-
-
-def _features(num_arms: int, images: NDArray[np.uint8] | None, rate_hz: float) -> dict[str, dict[str, Any]]:
-    """What each frame consists of, in the words of ``meta/info.json``."""
-    gripper = {"dtype": "float32", "shape": [ACTION_DIM * num_arms], "names": layout.axis_names(num_arms)}
-    features: dict[str, dict[str, Any]] = {layout.ACTION_KEY: gripper, layout.STATE_KEY: gripper}
-    if images is not None:
-        height, width = images.shape[1:3]
-        features[layout.VIDEO_KEY] = {
-            "dtype": "video",
-            "shape": [height, width, 3],
-            "names": ["height", "width", "channels"],
-            "info": {
-                "video.height": height,
-                "video.width": width,
-                "video.codec": "h264",
-                "video.pix_fmt": PIXEL_FORMAT,
-                "video.is_depth_map": False,
-                "video.fps": rate_hz,
-                "video.channels": 3,
-                "has_audio": False,
-            },
-        }
-    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
-    for key in ("frame_index", "episode_index", "index", "task_index"):
-        features[key] = {"dtype": "int64", "shape": [1], "names": None}
-    return features
-
-
-def _frame_table(columns: dict[str, NDArray]) -> pa.Table:
-    return pa.table(
-        {
-            key: pa.FixedSizeListArray.from_arrays(value.ravel(), value.shape[1]) if value.ndim == 2 else value
-            for key, value in columns.items()
-        }
-    )
-
-
-def _episode_table(row: dict[str, Any], statistics: Mapping[str, Statistics]) -> pa.Table:
-    """One row; the types are said, since a missing seed has none and all files must agree."""
-    table = {key: pa.array([value]) for key, value in row.items() if key != layout.SEED_COLUMN}
-    table[layout.SEED_COLUMN] = pa.array([row[layout.SEED_COLUMN]], type=pa.int64())
-    for key, entries in statistics.items():
-        for name, value in _listed(entries).items():
-            table[f"{STATISTICS_PREFIX}{key}/{name}"] = pa.array([value])
-    return pa.table(table)
-
-
-def _read_statistics(root: Path, episode: int) -> dict[str, Statistics]:
-    """The statistics that `_episode_table` wrote."""
-    table = read_table(root / layout.episode_path(layout.EPISODES_PATTERN, episode))
-    result: dict[str, dict[str, FloatArray]] = {}
-    for column in table.column_names:
-        if column.startswith(STATISTICS_PREFIX):
-            key, name = column.removeprefix(STATISTICS_PREFIX).rsplit("/", 1)
-            result.setdefault(key, {})[name] = np.array(table[column][0].as_py(), dtype=np.float64)
-    return dict(result)
 
 
 def _combined(earlier: Mapping[str, Statistics], statistics: Mapping[str, Statistics]) -> dict[str, Statistics]:
@@ -356,33 +308,12 @@ def _combined(earlier: Mapping[str, Statistics], statistics: Mapping[str, Statis
     return {key: combine([earlier[key], statistics[key]]) for key in statistics}
 
 
-def _listed(statistics: Statistics) -> dict[str, list]:
-    return {
-        name: value.astype(np.int64).tolist() if name == "count" else value.tolist()
-        for name, value in statistics.items()
-    }
-
-
-def _task_table(description: str) -> pa.Table:
-    """``meta/tasks.parquet``: a pandas table whose index is the task in words, as `lerobot` expects it."""
-    columns = [
-        {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
-        {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"},
-    ]
-    pandas = {
-        "index_columns": ["task"],
-        "column_indexes": [],
-        "columns": [{**column, "metadata": None} for column in columns],
-    }
-    table = pa.table({"task_index": pa.array([0], pa.int64()), "task": pa.array([description])})
-    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-
-
-def _parquet(table: pa.Table) -> bytes:
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink)
-    return sink.getvalue().to_pybytes()
-
-
 def _json(content: dict[str, Any]) -> bytes:
     return json.dumps(content, indent=2, ensure_ascii=False).encode()
+
+
+def _number(value: object) -> object:
+    """NumPy's numbers as JSON has them."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"an episode's info holds strings and numbers, not {type(value).__name__}")
