@@ -20,6 +20,7 @@ PEAKS = 4
 MATCHES_PER_POINT = 3
 VOTE_SHARPNESS = 4  # power of the similarity with which a match votes
 COLOUR_SCALE_M = 0.06  # metres that count as much as the difference between black and white in one channel
+COLOUR_CAP_M = 0.010  # and no difference counts more: objects of one kind come in many colours
 NEAR_M = 0.010  # residual at which a point counts about a third
 OWN_M = 0.04  # image points further from the object are not its own
 VARIANT_TURNS = np.deg2rad([0.0, -25.0, 25.0])
@@ -133,18 +134,14 @@ def closest_points(
     Both directions, because an object slid along itself covers its old place well: only the points left bare tell.
     """
     count, size = len(motions), len(source)
-    shape = (count, size, len(target))
-    squared = (target**2).sum(axis=1)
+    paint = ((source[:, None, 3:] - target[:, 3:]) ** 2).sum(axis=2).clip(max=COLOUR_CAP_M**2)
+    fixed = paint + (target[:, :3] ** 2).sum(axis=1)
     fits = np.zeros(count)
     for reach in (*reaches, 0.0):
-        moved = np.concatenate(
-            [
-                source[:, :3] @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3],
-                np.broadcast_to(source[:, 3:], (count, size, 3)),
-            ],
-            axis=2,
-        ).astype(np.float32)
-        costs = (moved**2).sum(axis=2)[..., None] + squared - 2 * (moved.reshape(-1, 6) @ target.T).reshape(shape)
+        moved = source[:, :3] @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
+        moved = moved.astype(np.float32)
+        products = (moved.reshape(-1, 3) @ (-2 * target[:, :3].T)).reshape(count, size, len(target))
+        costs = products + fixed + (moved**2).sum(axis=2)[..., None]
         forth, back = costs.argmin(axis=2), costs.argmin(axis=1)
         forth_cost = np.take_along_axis(costs, forth[..., None], axis=2)[..., 0]
         back_cost = np.take_along_axis(costs, back[:, None], axis=1)[:, 0]
