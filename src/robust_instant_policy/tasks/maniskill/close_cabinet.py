@@ -61,7 +61,7 @@ class Cabinet:
     shelf: bool
 
     @classmethod
-    def draw_seen(cls, rng: np.random.Generator) -> Cabinet:
+    def draw_seen(cls, number: int, rng: np.random.Generator) -> Cabinet:
         """Low and wide, painted or of oak, with a bar to pull at."""
         bodies = (Paint((0.80, 0.66, 0.46), grain=True), Paint((0.42, 0.55, 0.60)), WHITE)
         doors = (Paint((0.30, 0.38, 0.47)), Paint((0.62, 0.30, 0.22)), Paint((0.25, 0.45, 0.36)))
@@ -70,14 +70,14 @@ class Cabinet:
             depth=rng.uniform(0.13, 0.16),
             height=rng.uniform(0.13, 0.16),
             handle_kind="bar",
-            body=bodies[rng.integers(len(bodies))],
-            door=doors[rng.integers(len(doors))],
-            handle=(BLACK, STEEL)[rng.integers(2)],
+            body=bodies[number % 3],
+            door=doors[(number // 3 + number) % 3],
+            handle=(BLACK, STEEL)[number % 2],
             shelf=True,
         )
 
     @classmethod
-    def draw_unseen(cls, rng: np.random.Generator) -> Cabinet:
+    def draw_unseen(cls, number: int, rng: np.random.Generator) -> Cabinet:
         """Narrower and deeper, of dark wood or in other colours, with a knob."""
         bodies = (Paint((0.36, 0.24, 0.16), grain=True), Paint((0.55, 0.63, 0.50)), Paint((0.70, 0.68, 0.66)))
         doors = (Paint((0.86, 0.78, 0.60), grain=True), Paint((0.85, 0.62, 0.20)), Paint((0.45, 0.25, 0.42)))
@@ -86,8 +86,8 @@ class Cabinet:
             depth=rng.uniform(0.16, 0.19),
             height=rng.uniform(0.15, 0.18),
             handle_kind="knob",
-            body=bodies[rng.integers(len(bodies))],
-            door=doors[rng.integers(len(doors))],
+            body=bodies[number % 3],
+            door=doors[(number // 3 + number) % 3],
             handle=BRASS,
             shelf=False,
         )
@@ -144,16 +144,16 @@ class Cabinet:
         centre = np.array([DOOR_M / 2, -HINGE_SIDE * width / 2, GAP_M + height / 2])
         add_box(link, (DOOR_M, width, height), centre, self.door)
         rim = WHITE if self.door != WHITE else BLACK
-        edge = centre + (0, 0, height / 2)
+        edge = centre + np.array([0, 0, height / 2])
         add_box(link, (DOOR_M, width, 0.002), edge, rim, collide=False)
         at = np.array([0.0, -HINGE_SIDE * (width - 0.022), 0.55 * height])
         if self.handle_kind == "bar":
-            add_cylinder(link, 0.006, 0.06, at - (0.022, 0, 0), "z", self.handle)
+            add_cylinder(link, 0.006, 0.06, at - np.array([0.022, 0, 0]), "z", self.handle)
             for end in (-0.022, 0.022):
-                add_cylinder(link, 0.004, 0.022, at + (-0.011, 0, end), "x", self.handle)
+                add_cylinder(link, 0.004, 0.022, at + np.array([-0.011, 0, end]), "x", self.handle)
         else:
-            add_cylinder(link, 0.006, 0.014, at - (0.007, 0, 0), "x", self.handle)
-            add_cylinder(link, 0.013, 0.014, at - (0.02, 0, 0), "x", self.handle)
+            add_cylinder(link, 0.006, 0.014, at - np.array([0.007, 0, 0]), "x", self.handle)
+            add_cylinder(link, 0.013, 0.014, at - np.array([0.02, 0, 0]), "x", self.handle)
 
 
 @register_env("RIP-CloseCabinet-v1", max_episode_steps=600)
@@ -169,7 +169,9 @@ class CloseCabinetEnv(CellEnv):
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
-        self.shape = draw_object({"seen": Cabinet.draw_seen, "unseen": Cabinet.draw_unseen}, self.objects, self.draw("shape"))
+        self.shape = draw_object(
+            {"seen": Cabinet.draw_seen, "unseen": Cabinet.draw_unseen}, self.objects, self.draw("shape")
+        )
         self.cabinet = self.shape.build(self.scene)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:

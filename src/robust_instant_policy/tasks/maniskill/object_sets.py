@@ -13,8 +13,11 @@ T = TypeVar("T")
 
 
 def draw_object(
-    families: Mapping[str, Callable[[np.random.Generator], T]], objects: str, rng: np.random.Generator
+    families: Mapping[str, Callable[[int, np.random.Generator], T]], objects: str, rng: np.random.Generator
 ) -> T:
-    """One of the `OBJECTS_A_SET` objects of the set ``objects``, which are the same ones in every episode."""
+    """One of the `OBJECTS_A_SET` objects of the set ``objects``, which are the same ones in every episode.
+
+    ``families[objects](number, rng)`` makes the object of that number; its random numbers are always the same.
+    """
     number = int(rng.integers(OBJECTS_A_SET))
-    return families[objects](np.random.default_rng([number, *objects.encode()]))
+    return families[objects](number, np.random.default_rng([number, *objects.encode()]))

@@ -109,7 +109,12 @@ class Chest:
         for side in (-1, 1):
             at = (depth / 2, side * (width - BOARD_M) / 2, (height - BOARD_M) / 2)
             add_box(link, (depth, BOARD_M, height - BOARD_M), at, self.body)
-        add_box(link, (BOARD_M, width - 2 * BOARD_M, height - BOARD_M), (depth - BOARD_M / 2, 0, (height - BOARD_M) / 2), self.body)
+        add_box(
+            link,
+            (BOARD_M, width - 2 * BOARD_M, height - BOARD_M),
+            (depth - BOARD_M / 2, 0, (height - BOARD_M) / 2),
+            self.body,
+        )
         plinth = height - BOARD_M - self.drawer_height
         add_box(link, (FRONT_M, width - 2 * BOARD_M, plinth), (FRONT_M / 2, 0, plinth / 2), self.body)
         add_box(link, (0.001, width - 0.05, plinth * 0.7), (-0.0005, 0, plinth / 2), self.front, collide=False)

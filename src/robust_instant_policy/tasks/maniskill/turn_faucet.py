@@ -56,7 +56,7 @@ class Faucet:
     grip: Paint
 
     @classmethod
-    def draw_seen(cls, rng: np.random.Generator) -> Faucet:
+    def draw_seen(cls, number: int, rng: np.random.Generator) -> Faucet:
         """Round columns, round levers that end in a coloured ball."""
         return cls(
             column=rng.uniform(0.018, 0.023),
@@ -66,12 +66,12 @@ class Faucet:
             lever_half_width=rng.uniform(0.006, 0.008),
             turn=rng.uniform(np.deg2rad(80), np.deg2rad(95)),
             square=False,
-            metal=(STEEL, WHITE, BRASS)[rng.integers(3)],
-            grip=(RED, Paint((0.10, 0.25, 0.70)), BLACK)[rng.integers(3)],
+            metal=(STEEL, WHITE, BRASS)[number % 3],
+            grip=(RED, Paint((0.10, 0.25, 0.70)), BLACK)[(number // 3 + number) % 3],
         )
 
     @classmethod
-    def draw_unseen(cls, rng: np.random.Generator) -> Faucet:
+    def draw_unseen(cls, number: int, rng: np.random.Generator) -> Faucet:
         """Square columns, flat levers with a coloured end, other colours."""
         return cls(
             column=rng.uniform(0.020, 0.026),
@@ -81,8 +81,8 @@ class Faucet:
             lever_half_width=rng.uniform(0.008, 0.011),
             turn=rng.uniform(np.deg2rad(80), np.deg2rad(95)),
             square=True,
-            metal=(Paint((0.30, 0.31, 0.33), 0.4, 0.3), Paint((0.72, 0.45, 0.32), 0.4, 0.3))[rng.integers(2)],
-            grip=(Paint((0.16, 0.55, 0.30)), WHITE)[rng.integers(2)],
+            metal=(Paint((0.30, 0.31, 0.33), 0.4, 0.3), Paint((0.86, 0.83, 0.75), 0.4, 0.2))[number % 2],
+            grip=(Paint((0.16, 0.55, 0.30)), WHITE)[number // 2 % 2],
         )
 
     @property
@@ -151,7 +151,9 @@ class TurnFaucetEnv(CellEnv):
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
-        self.shape = draw_object({"seen": Faucet.draw_seen, "unseen": Faucet.draw_unseen}, self.objects, self.draw("shape"))
+        self.shape = draw_object(
+            {"seen": Faucet.draw_seen, "unseen": Faucet.draw_unseen}, self.objects, self.draw("shape")
+        )
         self.faucet = self.shape.build(self.scene)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
@@ -185,7 +187,9 @@ def turn(env: TurnFaucetEnv, rng: np.random.Generator) -> list[Stroke]:
     return [
         Stroke(np.array([at(0.0, APPROACH_M, height + ABOVE_M)]), closed=True, speed=0.35, error=0.005),
         Stroke(np.array([at(0.0, APPROACH_M, height)]), closed=True, speed=0.15, error=0.003),
-        Stroke(np.array([at(turned, 0.0, height) for turned in np.linspace(0.0, end, ARC_POINTS)]), closed=True, speed=0.13),
+        Stroke(
+            np.array([at(turned, 0.0, height) for turned in np.linspace(0.0, end, ARC_POINTS)]), closed=True, speed=0.13
+        ),
         Stroke(np.array([at(end, APPROACH_M, height + 0.03)]), closed=True, error=0.005),
     ]
 
@@ -195,7 +199,9 @@ def verdict(env: TurnFaucetEnv) -> str:
     state: dict[str, Any] = env.evaluate()
     if bool(state["success"]):
         return ""
-    return f"the lever is turned by {max(float(state['turned_share']), 0.0):.0%} of its range, {TARGET_SHARE:.0%} wanted"
+    return (
+        f"the lever is turned by {max(float(state['turned_share']), 0.0):.0%} of its range, {TARGET_SHARE:.0%} wanted"
+    )
 
 
 SPEC = TaskSpec(
