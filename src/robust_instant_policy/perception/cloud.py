@@ -30,7 +30,7 @@ MIN_PIECE = 15  # points; less is noise
 class Cloud:
     """Foreground points of an image: ``points (N, 3)`` metres, world; ``colours (N, 3)`` in [0, 1];
     ``pixels (N, 2)`` (u, v); ``cells (N,)`` of the descriptor map they lie in; ``pieces (N,)`` numbers the
-    connected pieces they form in the image.
+    connected pieces they form in the image. ``depth (H, W)`` is the whole image's, in metres.
     """
 
     points: FloatArray
@@ -38,6 +38,7 @@ class Cloud:
     pixels: IntArray
     cells: IntArray
     pieces: IntArray
+    depth: Float32Array
 
 
 def foreground(
@@ -93,4 +94,4 @@ def foreground(
     pieces = label(maximum_filter(mask, size=max(1, round(gap))), structure=np.ones((3, 3)))[0][place]
     large = np.bincount(pieces, minlength=1)[pieces] >= MIN_PIECE
     kept, pieces = kept[large], pieces[large]
-    return Cloud(points[kept], colours[kept], pixels[kept], cells[kept], pieces), note
+    return Cloud(points[kept], colours[kept], pixels[kept], cells[kept], pieces, depth), note

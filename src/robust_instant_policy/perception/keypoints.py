@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError
-from robust_instant_policy.geometry import FloatArray, project, transform_points
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception.cloud import foreground
-from robust_instant_policy.perception.descriptors import IntArray
 from robust_instant_policy.perception.network import choose_network
-from robust_instant_policy.perception.objects import MovingObject, View, moving_objects
+from robust_instant_policy.perception.objects import MovingObject, Registration, View, moving_objects
+from robust_instant_policy.perception.registration import NEAR_M
+from robust_instant_policy.perception.selection import lifted, select
 from robust_instant_policy.perception.settings import PAPER_SIMULATION, DescriptorSettings
 
 MIN_FIT = 0.15  # share of an object's points that must be explained in every demonstration
 MIN_OBJECT_POINTS = 25
+OFF_CENTRE = 0.4  # of half the image; no lens is mounted that far off
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +33,17 @@ class Located:
     pixels: FloatArray
     confidence: FloatArray
     notes: tuple[str, ...] = ()
+
+
+def check_intrinsics(observation: Observation) -> None:
+    """Raise `KeypointError` where the optical axis is far from the image's middle, as with another resolution's."""
+    height, width = observation.depth.shape
+    cx, cy = observation.intrinsics[:2, 2]
+    if not (abs(cx / (width / 2) - 1) < OFF_CENTRE and abs(cy / (height / 2) - 1) < OFF_CENTRE):
+        raise KeypointError(
+            f"the intrinsics belong to an image of about {2 * cx:.0f}x{2 * cy:.0f} pixels, but this one has "
+            f"{width}x{height}; scale them to it"
+        )
 
 
 class KeypointExtractor:
@@ -73,34 +86,53 @@ class KeypointExtractor:
             views.append(view)
             if note and note not in notes:
                 notes.append(note)
+        if len(views) == 1:
+            notes.append(
+                "one demonstration only: nothing to compare it with, so the keypoints are its most salient points"
+            )
+        if len({observation.rgb.shape for observation in observations}) > 1:
+            notes.append("the images differ in size; each was brought to the same")
         self._objects = self._shared(views)
-        poses = [[registration.pose for registration in thing.registrations] for thing in self._objects]
-        self._owner, self._model = self._choose(self._objects)
-        self.keypoints_ = np.stack(
-            [
-                np.stack([transform_points(poses[b][i], p) for b, p in zip(self._owner, self._model, strict=True)])
-                for i in range(len(views))
-            ]
-        )
-        self.pixels_ = np.stack(
-            [
-                project(points, view.observation.intrinsics, view.observation.camera_pose)
-                for points, view in zip(self.keypoints_, views, strict=True)
-            ]
-        )
+        owner: list[int] = []
+        places = []
+        for number, thing in enumerate(self._objects):
+            share = self.num_keypoints // len(self._objects) + (number < self.num_keypoints % len(self._objects))
+            points, replaced = select(thing, views, share, self.seed)
+            owner += [number] * share
+            places.append(points)
+            notes += replaced
+        self._owner, self._places = np.array(owner, dtype=np.intp), np.concatenate(places)
+        found = [self._place(view, [t.registrations[i] for t in self._objects]) for i, view in enumerate(views)]
+        self.keypoints_ = np.stack([located.keypoints for located in found])
+        self.pixels_ = np.stack([located.pixels for located in found])
         self.notes_ = tuple(notes)
         return self
 
     def locate(self, observation: Observation) -> Located:
-        """The keypoints in a new image."""
+        """The keypoints in a new image.
+
+        Raises `KeypointError` for an image in which nothing stands out, or without depth.
+        """
         view, note = self._view(observation)
-        found = [thing.find(view) for thing in self._objects]
-        points = np.stack([transform_points(found[b].pose, p) for b, p in zip(self._owner, self._model, strict=True)])
-        confidence = np.array([found[b].fit for b in self._owner])
-        pixels = project(points, observation.intrinsics, observation.camera_pose)
-        return Located(points, pixels, confidence, (note,) if note else ())
+        located = self._place(view, [thing.find(view) for thing in self._objects])
+        return replace(located, notes=(note, *located.notes)) if note else located
+
+    def _place(self, view: View, registrations: list[Registration]) -> Located:
+        """The keypoints of objects that were found in ``view``."""
+        poses = np.stack([registrations[number].pose for number in self._owner])
+        expected = (poses[:, :3, :3] @ self._places[..., None])[..., 0] + poses[:, :3, 3]
+        points, pixels, hanging = lifted(view, expected)
+        belief = np.array([(r.fit + r.agreement) / 2 for r in registrations])[self._owner]
+        confidence = belief * np.exp(-(((points - expected) ** 2).sum(axis=1)) / NEAR_M**2)
+        confidence[hanging] /= 2
+        notes = [f"keypoint {k} has no depth at its pixel; it is where its object says" for k in hanging]
+        for number, registration in enumerate(registrations):
+            if registration.fit < MIN_FIT:
+                notes.append(f"object {number} was hardly recognised (fit {registration.fit:.2f})")
+        return Located(points, pixels, np.clip(confidence, 0, 1), tuple(notes))
 
     def _view(self, observation: Observation) -> tuple[View, str]:
+        check_intrinsics(observation)
         descriptors = self._network.describe(observation.rgb)
         cloud, note = foreground(observation, descriptors, self._network.salient, self.workspace, self.seed)
         if len(cloud.points) < MIN_OBJECT_POINTS:
@@ -118,17 +150,3 @@ class KeypointExtractor:
                 f"worst other image (needed: {MIN_FIT:.2f}); do all demonstrations show the same object?"
             )
         return shared
-
-    def _choose(self, objects: list[MovingObject]) -> tuple[IntArray, FloatArray]:
-        """Keypoints shared out among the objects, spread over each by farthest-point sampling."""
-        owner, model = [], []
-        for number, thing in enumerate(objects):
-            points = thing.templates[0].painted[:, :3].astype(np.float64)
-            share = self.num_keypoints // len(objects) + (number < self.num_keypoints % len(objects))
-            chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())]
-            while len(chosen) < share:
-                distance = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(axis=1)
-                chosen.append(int(distance.argmax()))
-            owner += [number] * share
-            model += [points[c] for c in chosen[:share]]
-        return np.array(owner, dtype=np.intp), np.array(model)

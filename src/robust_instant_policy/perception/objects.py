@@ -20,6 +20,7 @@ MAX_OBJECT_CELLS = 80
 SAME_OBJECT_M = 0.025  # points of an image this near to where the object was found belong to it
 TEMPLATES_TRIED = 2
 BEST_VIEWS = 3  # demonstrations whose descriptors judge a motion
+BUDDY_PATCHES = 2.0  # distance from its place within which a best buddy is one
 STRAY_M = 0.012  # from its place in another image at which a point does not move with its object,
 STRAY_SHARE = 0.4  # if that is so in this share of the images
 MIN_PART = 0.08  # share of an object's points that makes a part of its own
@@ -37,6 +38,12 @@ class View:
     painted: Float32Array
     cells: IntArray
     cell_points: FloatArray
+
+    @property
+    def patch_size(self) -> float:
+        """Distance between neighbouring patches on the table, in metres."""
+        depth = np.nanmedian(self.cloud.depth)
+        return float(self.descriptors.step.mean() * depth / self.observation.intrinsics[0, 0])
 
     @classmethod
     def from_cloud(cls, observation: Observation, descriptors: DescriptorMap, cloud: Cloud, seed: int) -> View:
@@ -98,8 +105,6 @@ class MovingObject:
         for index in sorted(alone, key=lambda i: -alone[i].fit - alone[i].agreement):
             self.registrations[index] = self.find(views[index])
             self._remember(views[index], self.registrations[index])
-        order = [0, *sorted(alone, key=lambda i: -alone[i].fit - alone[i].agreement)]
-        self.demonstration_of = order
 
     @property
     def worst_fit(self) -> float:
@@ -113,7 +118,7 @@ class MovingObject:
         motions = proposals(
             np.concatenate([template.points for template in self.templates]),
             view.cell_points,
-            np.concatenate(similar)[:, :inside],
+            np.concatenate(similar)[:, :inside].astype(np.float64),
         )
         found = []
         for index in np.argsort(-likeness, kind="stable")[:TEMPLATES_TRIED]:
@@ -123,15 +128,37 @@ class MovingObject:
             found.append(Registration(pose, fit, agreement, int(index)))
         return max(found, key=lambda registration: registration.fit + registration.agreement)
 
+    def residuals(self, views: Sequence[View], points: FloatArray) -> FloatArray:
+        """Distance ``(I, N)`` in metres from where ``points (N, 3)`` of the first view should be to what is there."""
+        pairs = zip(views, self.registrations, strict=True)
+        return np.stack([cKDTree(v.cloud.points).query(transform_points(r.pose, points))[0] for v, r in pairs])
+
     def strays(self, views: Sequence[View]) -> IntArray:
         """Points of the first template that do not move with the rest, if there are enough to be a part themselves."""
-        points = self.templates[0].painted[:, :3]
-        astray = np.zeros(len(points))
-        for view, registration in zip(views, self.registrations, strict=True):
-            distance, _ = cKDTree(view.painted[:, :3]).query(transform_points(registration.pose, points))
-            astray += distance > STRAY_M
-        stray = np.flatnonzero(astray > STRAY_SHARE * len(views))
+        points = self.templates[0].painted[:, :3].astype(np.float64)
+        stray = np.flatnonzero((self.residuals(views, points) > STRAY_M).mean(axis=0) > STRAY_SHARE)
         return stray if len(stray) >= MIN_PART * len(points) else stray[:0]
+
+    def buddies(self, views: Sequence[View], points: FloatArray) -> FloatArray:
+        """Share ``(N,)`` of ``views`` in which each of ``points (N, 3)`` has a best buddy near its place.
+
+        Two descriptors are best buddies if each is the other's nearest neighbour (Amir et al. 2022); near is within
+        two patches, and the points are places in the first view.
+        """
+        home = views[0]
+        cells = home.cells[: len(home.cell_points)]
+        mine = cKDTree(home.cell_points).query(points)[1]
+        reach = BUDDY_PATCHES * home.patch_size
+        votes = np.zeros(len(points))
+        for view, registration in zip(views[1:], self.registrations[1:], strict=True):
+            similar = home.descriptors.similarities(cells, view.descriptors, view.cells[: len(view.cell_points)])
+            there = similar.argmax(axis=1)
+            back = similar.argmax(axis=0)[there]
+            cycle = np.linalg.norm(home.cell_points[back] - home.cell_points, axis=1) < reach
+            expected = transform_points(registration.pose, home.cell_points)
+            near = np.linalg.norm(view.cell_points[there] - expected, axis=1) < reach
+            votes += (cycle & near)[mine]
+        return votes / max(len(views) - 1, 1) if len(views) > 1 else np.ones(len(points))
 
     def _remember(self, view: View, registration: Registration, points: Float32Array | None = None) -> None:
         back = invert_pose(registration.pose)
