@@ -92,7 +92,7 @@ class Candidates:
             return np.array([low])
         return np.linspace(low, high, max(2, int(np.median(self.lengths))))
 
-    def split(self, rows: FloatArray) -> list[FloatArray]:
+    def split(self, rows: np.ndarray) -> list[np.ndarray]:
         """Rows ``(N, ...)`` given back candidate by candidate."""
         return np.split(rows, self.starts[1:-1])
 

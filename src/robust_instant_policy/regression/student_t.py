@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,6 +38,7 @@ TOLERANCE = 1e-6  # log-likelihood gained per number: less in an iteration moves
 DRAFT_ITERATIONS = 6  # of the fit without smoothing from which outlying stretches are judged,
 REDRAFT_ITERATIONS = 3  # and more without those, from which the smoothing is
 SCALE_FLOOR = 1e-3  # of a dimension's motion: models that write few digits often agree to the last one
+ROUNDING = 1e-12  # of a dimension's size: below it differences are those of floating-point arithmetic
 PRIOR_SAMPLES = 2.0  # candidates' worth of trust in the scale of all steps, against that of one step alone
 PAIRWISE_LIMIT = 4_000_000  # numbers compared pair by pair to find a start; beyond it there are enough for a median
 
@@ -82,7 +83,7 @@ class StudentTRegression:
 
     ``dof`` is the paper's ν; ``inf`` is the Gaussian ablation, whose mean is the mean of the candidates.
     ``unit`` is what is right or wrong together: the numbers of a "step" (whose outlying stretches are then left out
-    whole), those of a whole "trajectory", or every "number" by itself, as in the paper's Eq. 1.
+    whole), those of a whole "trajectory", or every "number" by itself, as in the paper's Eq. 1, with ``groups`` unused.
     ``groups (D,)`` are labels of the dimensions that share one scale, such as the coordinates of points, which makes
     the fit independent of the choice of axes; without it each dimension has its own.
 
@@ -100,54 +101,52 @@ class StudentTRegression:
     def fit(self, candidates: Sequence[ArrayLike], times: Sequence[ArrayLike] | None = None) -> StudentTRegression:
         """Fit to ``candidates``, each ``(T_q, D)``, at ``times``, each ``(T_q,)`` in [0, 1] (evenly spread if None)."""
         data = Candidates.from_arrays(candidates, times)
-        model = _Model(data, self.dof, self.unit, self._group_matrix(data.num_dimensions))
-        state = model.start()
-        if np.isfinite(self.dof):
-            for _ in range(DRAFT_ITERATIONS):
-                state, _ = model.improve(state)
-            if self.unit == "step":
-                model.leave_out_stretches(state)
-                for _ in range(REDRAFT_ITERATIONS):
-                    state, _ = model.improve(state)
-            model.choose_stiffness(state)
-            model.scale_is_free = False
-        state, trace = model.maximise(state)
+        groups = self._group_matrix(data.num_dimensions)
+        if self.unit == "number":
+            columns = np.arange(data.num_dimensions)[:, None]
+            parts = [(replace(data, values=data.values[:, column]), column) for column in columns]
+        else:
+            parts = [(data, np.arange(data.num_dimensions))]
+        self._parts = [_fit(part, self.dof, self.unit, groups[np.ix_(column, column)]) for part, column in parts]
         self.knots = data.grid()
-        self.stiffness = model.stiffness
-        self.log_likelihood = np.array(trace)
-        self.num_iterations = len(trace)
+        self.stiffness = float(np.mean([part.model.stiffness for part in self._parts]))
+        self.num_iterations = max(len(part.trace) for part in self._parts)
         self.converged = self.num_iterations < MAX_ITERATIONS
-        self.weights = data.split(np.minimum(model.weights(state), 1.0))
-        self._state, self._model = state, model
+        self.log_likelihood = np.sum(
+            [np.pad(part.trace, (0, self.num_iterations - len(part.trace)), "edge") for part in self._parts], axis=0
+        )
+        weights = np.mean([np.minimum(part.model.weights(part.state), 1.0) for part in self._parts], axis=0)
+        self.weights = data.split(weights)
         return self
 
     def mean(self, times: ArrayLike | None = None) -> FloatArray:
         """The robust trajectory μ ``(T, D)`` at ``times (T,)``, by default at the knots (Oh et al. 2025, Eq. 4)."""
-        return self._evaluate(self._state.curve, times)
+        return self._evaluate(np.hstack([part.state.curve for part in self._parts]), times)
 
     def scale(self, times: ArrayLike | None = None) -> FloatArray:
         """The scale σ ``(T, D)`` of trustworthy candidates about the mean at ``times (T,)``."""
-        return self._evaluate(np.sqrt(self._state.profile[:, None] * self._state.squared_scale), times)
+        squared = np.hstack([part.state.profile[:, None] * part.state.squared_scale for part in self._parts])
+        return self._evaluate(np.sqrt(squared), times)
 
     def standard_error(self, times: ArrayLike | None = None) -> FloatArray:
         """How far ``(T, D)`` the mean may be off at ``times (T,)``; infinite for a single candidate."""
-        return self._evaluate(np.sqrt(self._error[0]), times)
+        return self._evaluate(np.sqrt(self._error()[0]), times)
 
     def interval(self, level: float = 0.9, times: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
         """Lower and upper ends, each ``(T, D)``, between which the truth lies with probability ``level``."""
         if not 0 < level < 1:
             raise InvalidValueError(f"level must lie between 0 and 1, got {level} (a scalar, shape ())")
-        error, deciding = self._error
+        error, deciding = self._error()
         freedom = error_freedom(deciding)
         reach = self._evaluate(stdtrit(freedom, (1 + level) / 2)[:, None] * np.sqrt(error), times)
         mean = self.mean(times)
         return mean - reach, mean + reach
 
-    @cached_property
     def _error(self) -> tuple[FloatArray, FloatArray]:
         if len(self.weights) == 1:
-            return np.full_like(self._state.curve, np.inf), np.ones(len(self.knots))
-        return self._model.squared_error(self._state)
+            return np.full_like(self.mean(), np.inf), np.ones(len(self.knots))
+        errors, deciding = zip(*[part.model.squared_error(part.state) for part in self._parts], strict=True)
+        return np.hstack(errors), np.mean(deciding, axis=0)
 
     def _evaluate(self, values: FloatArray, times: ArrayLike | None) -> FloatArray:
         if times is None:
@@ -176,6 +175,30 @@ class _State:
     profile: FloatArray
 
 
+class _Part(NamedTuple):
+    """The dimensions that were fitted together."""
+
+    model: _Model
+    state: _State
+    trace: list[float]
+
+
+def _fit(data: Candidates, dof: float, unit: str, groups: FloatArray) -> _Part:
+    model = _Model(data, dof, unit, groups)
+    state = model.start()
+    if np.isfinite(dof):
+        for _ in range(DRAFT_ITERATIONS):
+            state, _ = model.improve(state)
+        if unit != "trajectory":
+            model.leave_out_stretches(state)
+            for _ in range(REDRAFT_ITERATIONS):
+                state, _ = model.improve(state)
+        model.choose_stiffness(state)
+        model.scale_is_free = False
+    state, trace = model.maximise(state)
+    return _Part(model, state, trace)
+
+
 class _Model:
     """The penalised likelihood of one set of candidates."""
 
@@ -197,8 +220,8 @@ class _Model:
         blocks = self.data.at(self.basis.knots)
         median = np.median(blocks, axis=0)
         deviation = np.median(np.abs(blocks - median), axis=0)
-        moved = np.ptp(median, axis=0) + np.finfo(float).eps * np.abs(median).max(axis=0) + 1e-100
-        self._floor = self.groups @ (SCALE_FLOOR * moved) ** 2
+        smallest = SCALE_FLOOR * np.ptp(median, axis=0) + ROUNDING * np.abs(median).max(axis=0) + 1e-100
+        self._floor = self.groups @ smallest**2
         squared = self.groups @ (1.5 * deviation.mean(axis=0)) ** 2 + self._floor
         curve = median
         if np.isfinite(self.dof) and blocks.size * len(blocks) < PAIRWISE_LIMIT and len(blocks) > 1:

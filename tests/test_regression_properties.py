@@ -1,0 +1,149 @@
+"""What must hold for any candidates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.regression import StudentTMixture, StudentTRegression, robust_gripper_trajectory
+from tests.regression_scenes import KINDS, draw_scene
+
+SETTINGS = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+
+
+@st.composite
+def candidates(draw, min_candidates=1, equal_lengths=False, hallucinated=True):
+    """Q noisy copies of a walk, some of them off, of equal or different lengths."""
+    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
+    count = draw(st.integers(min_candidates, 7))
+    dimension = draw(st.integers(1, 6))
+    length = draw(st.integers(1, 20))
+    walk = np.cumsum(rng.normal(0, 0.05, (40, dimension)), axis=0)
+    result = []
+    for _ in range(count):
+        steps = length if equal_lengths else length + draw(st.integers(0, 3))
+        at = np.linspace(0, 39, steps)
+        curve = np.stack([np.interp(at, np.arange(40), column) for column in walk.T], axis=1)
+        result.append(curve + rng.normal(0, 0.003, curve.shape))
+    if hallucinated and draw(st.booleans()):
+        result[0] = result[0] + rng.normal(0, 0.3, dimension)
+    return result
+
+
+AT = np.linspace(0, 1, 17)
+
+
+def motion_of(array):
+    return max(float(np.ptp(np.concatenate(array), axis=0).max()), 1e-3)
+
+
+@SETTINGS
+@given(candidates(), st.randoms(use_true_random=False), st.sampled_from(["step", "trajectory", "number"]))
+def test_order_of_candidates_does_not_matter(given_candidates, random, unit):
+    order = list(range(len(given_candidates)))
+    random.shuffle(order)
+    one = StudentTRegression(unit=unit).fit(given_candidates)
+    other = StudentTRegression(unit=unit).fit([given_candidates[q] for q in order])
+    assert np.allclose(one.mean(AT), other.mean(AT), atol=1e-6 * motion_of(given_candidates))
+    for place, q in enumerate(order):
+        assert np.allclose(one.weights[q], other.weights[place], atol=1e-4)
+
+
+@SETTINGS
+@given(candidates(), st.floats(1e-3, 1e3), st.floats(-100, 100))
+def test_scaling_and_shifting_the_input_move_the_output_alike(given_candidates, factor, shift):
+    one = StudentTRegression().fit(given_candidates)
+    other = StudentTRegression().fit([candidate * factor + shift for candidate in given_candidates])
+    tolerance = 1e-5 * motion_of(given_candidates)
+    assert np.allclose((other.mean(AT) - shift) / factor, one.mean(AT), atol=tolerance + 1e-12 * abs(shift) / factor)
+    if len(given_candidates[0]) > 2:
+        assert np.allclose(other.scale(AT) / factor, one.scale(AT), rtol=1e-2, atol=tolerance)
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(st.integers(0, 1000), st.sampled_from(list(KINDS)), st.sampled_from(["em", "mixture"]))
+def test_rigid_motions_of_the_input_move_the_output_alike(seed, kind, estimator):
+    scene = draw_scene(seed, "piecewise", 5, 1, kind)
+    rng = np.random.default_rng(seed)
+    rotation, shift = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3)
+
+    def moved(actions):
+        result = np.array(actions)
+        result[:, :9] = (result[:, :9].reshape(-1, 3, 3) @ rotation.T + shift).reshape(-1, 9)
+        return result
+
+    one = robust_gripper_trajectory(scene.candidates, estimator=estimator)
+    other = robust_gripper_trajectory([moved(candidate) for candidate in scene.candidates], estimator=estimator)
+    # the start is a median of coordinates, which turns with the axes only roughly; what it starts does not
+    assert np.allclose(other.actions, moved(one.actions), atol=1e-3)
+    assert other.hallucinated.tolist() == one.hallucinated.tolist()
+
+
+@SETTINGS
+@given(candidates(equal_lengths=True), st.sampled_from(["step", "trajectory", "number"]))
+def test_towards_infinite_degrees_of_freedom_the_fit_becomes_the_mean(given_candidates, unit):
+    mean = np.mean(given_candidates, axis=0)
+    gaussian = StudentTRegression(dof=np.inf, unit=unit).fit(given_candidates)
+    assert np.allclose(gaussian.mean(), mean, atol=1e-9)
+    assert all((weight == 1).all() for weight in gaussian.weights)
+    nearly = StudentTRegression(dof=1e7, unit=unit).fit(given_candidates)
+    assert np.allclose(nearly.mean(), mean, atol=1e-4)
+
+
+@SETTINGS
+@given(candidates(min_candidates=4, hallucinated=False), st.integers(0, 3), st.sampled_from(["step", "number"]))
+def test_a_candidate_moved_to_infinity_changes_nothing(given_candidates, which, unit):
+    def fit_with(distance):
+        moved = list(given_candidates)
+        moved[which] = moved[which] + distance
+        return StudentTRegression(unit=unit).fit(moved)
+
+    far, farther = fit_with(1e5), fit_with(1e8)
+    assert np.allclose(far.mean(AT), farther.mean(AT), atol=1e-5)
+    assert far.weights[which].max() < 1e-3
+    rest = [candidate for q, candidate in enumerate(given_candidates) if q != which]
+    if len({len(candidate) for candidate in given_candidates}) == 1:
+        assert np.abs(far.mean(AT) - StudentTRegression(unit=unit).fit(rest).mean(AT)).max() < 0.01
+
+
+@SETTINGS
+@given(candidates(), st.sampled_from([0.5, 1.5, np.inf]), st.sampled_from(["step", "trajectory", "number"]))
+def test_every_answer_is_finite_and_the_likelihood_never_falls(given_candidates, dof, unit):
+    fit = StudentTRegression(dof, unit).fit(given_candidates)
+    assert np.isfinite(fit.mean(AT)).all()
+    assert (fit.scale(AT) >= 0).all()
+    assert np.isfinite(fit.scale(AT)).all()
+    assert (np.diff(fit.log_likelihood) > -1e-6 * (1 + np.abs(fit.log_likelihood[:-1]))).all()
+
+
+@pytest.mark.parametrize("estimator", [StudentTRegression, StudentTMixture])
+@pytest.mark.parametrize("dof", [1.5, np.inf])
+def test_degenerate_candidates_give_sensible_answers(estimator, dof):
+    line = np.stack([np.linspace(0, 0.3, 10), np.full(10, 0.2), np.zeros(10)], axis=1)
+    for same in ([line], [line] * 2, [line] * 5):
+        fit = estimator(dof).fit(same)
+        assert np.allclose(fit.mean(np.linspace(0, 1, 10)), line, atol=1e-9)
+        assert fit.scale().max() < 1e-3
+        assert np.isfinite(fit.scale()).all()
+    between = estimator(dof).fit([line, line + 0.1]).mean(np.linspace(0, 1, 10))
+    assert ((between > line - 0.01) & (between < line + 0.11)).all()
+    assert np.allclose(estimator(dof).fit([line[:1], line[:1]]).mean(np.array([0.0, 0.5])), line[0])
+    assert np.isfinite(estimator(dof).fit([line[:1], line]).mean(AT)).all()
+
+
+def test_an_outlier_of_a_thousand_kilometres_is_ignored():
+    rng = np.random.default_rng(0)
+    truth = np.cumsum(rng.normal(0, 0.02, (30, 9)), axis=0)
+    candidates = truth + rng.normal(0, 0.003, (5, 30, 9))
+    candidates[2, 7, 4] = 1e6
+    candidates[3] += 1e6
+    for estimator in (StudentTRegression(), StudentTMixture()):
+        assert np.abs(estimator.fit(candidates).mean() - truth).max() < 0.015
+
+
+def test_the_error_of_a_single_candidate_is_unknown():
+    fit = StudentTRegression().fit([np.zeros((4, 2))])
+    assert np.isinf(fit.standard_error()).all()
