@@ -198,7 +198,7 @@ def test_after_a_fault_the_question_is_asked_again(proxy, fault):
 def test_a_hanging_server_costs_no_more_than_the_deadline(proxy):
     model = connect(f"{proxy(lambda: 'hang').url}#anything")
     start = time.monotonic()
-    with pytest.raises(ModelError, match="gave no answer within 1.5 s"):
+    with pytest.raises(ModelError, match=r"gave no answer within 1\.5 s"):
         model.sample([PAIRS], 3, temperature=0.5, deadline_s=1.5)
     assert time.monotonic() - start < 1.5 + GRACE_S
 
@@ -211,7 +211,7 @@ def test_a_request_that_hangs_once_is_repeated_within_the_deadline(proxy):
 
 def test_nothing_at_the_address_is_said_in_one_line():
     start = time.monotonic()
-    with pytest.raises(ModelError, match="nothing answers at http://127.0.0.1:9/v1") as caught:
+    with pytest.raises(ModelError, match=r"nothing answers at http://127\.0\.0\.1:9/v1") as caught:
         connect("http://127.0.0.1:9/v1#m").sample([PAIRS], 3, temperature=0.5, deadline_s=60)
     assert "\n" not in str(caught.value)
     assert time.monotonic() - start < 30
@@ -266,7 +266,7 @@ def test_plans_through_a_broken_network_end_in_time_and_leave_nothing_behind(pro
     model = connect(f"{between.url}#anything")
     threads = threading.active_count()
     sockets = _open_sockets()
-    outcomes = []
+    outcomes, complaints = [], []
     for plan in range(FAULT_PLANS):
         start = time.monotonic()
         try:
@@ -277,9 +277,10 @@ def test_plans_through_a_broken_network_end_in_time_and_leave_nothing_behind(pro
             assert all(is_pair(0, answer.text) for own in answers for answer in own)
         except ModelError as error:
             outcomes.append(-1)
-            assert "\n" not in str(error)
+            complaints.append(str(error))
         assert time.monotonic() - start < FAULT_DEADLINE_S + GRACE_S
     print({outcome: outcomes.count(outcome) for outcome in sorted(set(outcomes))})
+    assert not any("\n" in complaint for complaint in complaints)
     assert set(faults) <= set(between.seen) or FAULT_PLANS < 20
     assert threading.active_count() == threads
     assert _open_sockets() <= sockets

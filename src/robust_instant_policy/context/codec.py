@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from robust_instant_policy.geometry import FloatArray
 
 MM = 1000.0  # per metre
+ROW_DIGITS = 4  # of a number of a whole trajectory: up to 10 m
 
 _MINUS = str.maketrans(dict.fromkeys("−–—‒﹣－", "-"))
 _BRACKETS = str.maketrans(dict.fromkeys("[](){}|", " "))
@@ -36,8 +37,23 @@ def row_grammar(digits: Sequence[int]) -> str:
 
 
 def row_pattern(digits: Sequence[int]) -> str:
-    """The same as a regular expression."""
-    return " ".join(f"-?[0-9]{{1,{count}}}" for count in digits) + r"\n"
+    """The same as a regular expression, without the line's end."""
+    return " ".join(f"-?[0-9]{{1,{count}}}" for count in digits)
+
+
+def rows_grammar(least: int, most: int, columns: int, state_columns: Sequence[int]) -> str:
+    """GBNF for ``least`` to ``most`` lines of ``columns`` integers, 0 or 1 in ``state_columns``, and an empty line."""
+    row = ' " " '.join("state" if column in state_columns else "number" for column in range(columns))
+    return (
+        f'root ::= row{{{least},{most}}} "\\n"\nrow ::= {row} "\\n"\n'
+        f'number ::= "-"? [0-9]{{1,{ROW_DIGITS}}}\nstate ::= [01]'
+    )
+
+
+def rows_pattern(least: int, most: int, columns: int, state_columns: Sequence[int]) -> str:
+    """The same as a regular expression, without the empty line."""
+    row = " ".join("[01]" if column in state_columns else f"-?[0-9]{{1,{ROW_DIGITS}}}" for column in range(columns))
+    return rf"(?:{row}\n){{{least},{most}}}"
 
 
 def read_row(text: str, columns: int) -> FloatArray | None:

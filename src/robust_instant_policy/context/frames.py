@@ -16,15 +16,20 @@ from typing import Literal
 
 import numpy as np
 
-from robust_instant_policy.geometry import FloatArray, fit_rigid, make_pose, transform_points
+from robust_instant_policy.geometry import FloatArray, fit_rigid, invert_pose, make_pose, transform_points
 
 RIGID_SPREAD_M = 0.010  # keypoints whose distance varies less than this belong to the same object
+DEMOS_TO_TELL_OBJECTS = 3  # with fewer, all distances look alike
+DEMOS_FOR_MEDIANS = 5  # with fewer, a wrong one cannot be told
 OUTLIER_M = 0.006  # a keypoint this far from where the others put it counts half
+SHAPE_ROUNDS = 2  # of fitting the demonstrations' keypoints to each other
 SPREAD_FLOOR_M = 0.002  # differences of spread below this mean nothing
 SWITCH_COST = 1.0  # a change of frame must make the spread e times smaller for one step, or sqrt(e) for two
 KEY_STEP_WEIGHT = 3.0  # how much more the start, the end and gripper changes count
-DISTANCE_COST_PER_M = 0.2  # of frames that agree equally, the one nearer to the gripper
-WORLD_DISTANCE_M = 0.5  # the world frame counts as being this far away
+FEW_POINTS_COST = 0.5  # divided by the number of keypoints: of frames that agree equally, the one on more of them
+TILT_COST = 0.1  # of frames that agree equally, the one that stays upright
+DISTANCE_COST_PER_M = 4.0  # divided by the number of demonstrations: the fewer, the more it matters what is near
+WORLD_DISTANCE_M = 0.25  # the world frame counts as being this far away
 
 MAD_TO_STD = 1.4826
 
@@ -118,35 +123,42 @@ def candidate_frames(keypoints: FloatArray) -> list[Frame]:
     closeness = np.median(distances, axis=0)
     groups: dict[tuple[int, ...], None] = {}
     for k in range(num_points):
-        together = (
-            [j for j in range(num_points) if j == k or varies[k, j] < RIGID_SPREAD_M]
-            if num_demos > 2
-            else range(num_points)
-        )
+        if num_demos >= DEMOS_TO_TELL_OBJECTS:
+            together = [j for j in range(num_points) if j == k or varies[k, j] < RIGID_SPREAD_M]
+        else:
+            together = list(range(num_points))
         near = sorted(together, key=lambda j: closeness[k, j])
-        for size in {2, 3, 5, len(near)}:
+        whole = len(near) if num_demos >= DEMOS_TO_TELL_OBJECTS else 0
+        for size in {2, 3, 5, whole}:
             if 2 <= size <= len(near):
                 groups[tuple(sorted(near[:size]))] = None
-    reference = _most_typical(keypoints)
     for members in groups:
-        shape = keypoints[reference, list(members)]
-        shape = shape - shape.mean(axis=0)
         if len(members) >= 2:
-            frames.append(Frame("upright", members, shape))
+            frames.append(Frame("upright", members, _mean_shape(keypoints[:, list(members)], upright=True)))
         if len(members) >= 3:
-            frames.append(Frame("rigid", members, shape))
+            frames.append(Frame("rigid", members, _mean_shape(keypoints[:, list(members)], upright=False)))
     return frames
 
 
+def _mean_shape(points: FloatArray, upright: bool) -> FloatArray:
+    """The shape ``(N, 3)`` about its middle of which ``points (I, N, 3)`` are noisy, moved copies."""
+    distances = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
+    typical = int(np.argmin(np.abs(distances - np.median(distances, axis=0)).sum(axis=(1, 2))))
+    shape = points[typical]
+    for _ in range(SHAPE_ROUNDS):
+        shape = shape - shape.mean(axis=0)
+        poses = [robust_fit(shape, own, upright) for own in points]
+        back = [transform_points(invert_pose(pose), own) for pose, own in zip(poses, points, strict=True)]
+        shape = np.median(back, axis=0)
+    return shape - shape.mean(axis=0)
+
+
 def spread(values: FloatArray) -> FloatArray:
-    """Robust standard deviation over the first axis (from the median absolute deviation)."""
+    """Standard deviation over the first axis: from the median absolute deviation where there are enough values for
+    one wrong one not to matter, the plain one where each counts."""
+    if len(values) < DEMOS_FOR_MEDIANS:
+        return values.std(axis=0)
     return MAD_TO_STD * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
-
-
-def _most_typical(keypoints: FloatArray) -> int:
-    """The scene whose keypoints are, as a set of distances, nearest to the median scene."""
-    distances = np.linalg.norm(keypoints[:, :, None] - keypoints[:, None], axis=-1)
-    return int(np.argmin(np.abs(distances - np.median(distances, axis=0)).sum(axis=(1, 2))))
 
 
 def choose_frames(
@@ -163,7 +175,10 @@ def choose_frames(
     scatter = np.stack([np.sqrt((spread(values) ** 2).sum(axis=-1).mean(axis=-1)) for values in local])  # (F, T)
     distance = np.median(np.linalg.norm(offset, axis=-1).min(axis=-1), axis=1)  # (F, T)
     distance[[frame.kind == "world" for frame in frames]] = WORLD_DISTANCE_M
-    cost = np.log(scatter + SPREAD_FLOOR_M) + DISTANCE_COST_PER_M * distance
+    cost = np.log(scatter + SPREAD_FLOOR_M) + DISTANCE_COST_PER_M / points.shape[0] * distance
+    for own, frame in zip(cost, frames, strict=True):
+        own += FEW_POINTS_COST / max(len(frame.members), 1) * (frame.kind != "world")
+        own += TILT_COST * (frame.kind == "rigid")
     weight = np.ones(points.shape[1])
     weight[list(key_steps)] = KEY_STEP_WEIGHT
     cost = cost * weight

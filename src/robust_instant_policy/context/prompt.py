@@ -13,10 +13,11 @@ from robust_instant_policy.context.alignment import align
 from robust_instant_policy.context.codec import (
     MM,
     millimetres,
-    read_row,
     read_rows,
     row_grammar,
     row_pattern,
+    rows_grammar,
+    rows_pattern,
     write_row,
 )
 from robust_instant_policy.context.frames import WORLD, Frame, candidate_frames, choose_frames
@@ -40,6 +41,7 @@ INSTRUCTION = (
 
 Layout = Literal["sequence", "factorised"]
 Frames = Literal["world", "adaptive"]
+Order = Literal["given", "nearest-last"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +49,14 @@ class _Question:
     """What one query asks: the numbers ``asked`` (step, dimension) of neighbouring steps written in one frame.
 
     ``digits`` bounds the length of each, ``inputs`` are the keypoint coordinates shown with it (in the frame of
-    ``step``), and ``examples`` is the text of the demonstrations.
+    ``step``), and ``examples`` has a line for each demonstration.
     """
 
     step: int
     asked: tuple[tuple[int, int], ...]
     digits: tuple[int, ...]
     inputs: tuple[int, ...]
-    examples: str
+    examples: tuple[str, ...]
 
 
 class InContextPrompt:
@@ -64,15 +66,20 @@ class InContextPrompt:
     demonstrations agree best. ``layout="sequence"`` puts whole trajectories into one prompt (with the world frame
     this is Keypoint Action Tokens, Di Palo and Johns 2024); ``"factorised"`` asks for each step by itself.
 
+    ``order="nearest-last"`` puts the demonstrations whose keypoints lie nearest to the new scene's at the end, at
+    the cost that a model cannot go on from what it read for the last scene, as it can with ``"given"``.
+
     After `fit`, ``frames_`` lists the frame of each step.
     """
 
-    def __init__(self, frames: Frames = "adaptive", layout: Layout = "factorised"):
+    def __init__(self, frames: Frames = "adaptive", layout: Layout = "factorised", order: Order = "given"):
         if frames not in ("world", "adaptive"):
             raise InvalidValueError(f"frames must be 'world' or 'adaptive', got {frames!r}")
         if layout not in ("sequence", "factorised"):
             raise InvalidValueError(f"layout must be 'sequence' or 'factorised', got {layout!r}")
-        self.frames, self.layout = frames, layout
+        if order not in ("given", "nearest-last"):
+            raise InvalidValueError(f"order must be 'given' or 'nearest-last', got {order!r}")
+        self.frames, self.layout, self.order = frames, layout, order
 
     def fit(self, keypoints: FloatArray, trajectories: Sequence[Trajectory]) -> InContextPrompt:
         """Learn nothing but what to write: ``keypoints (I, K, 3)`` metres and a trajectory of each demonstration."""
@@ -90,24 +97,19 @@ class InContextPrompt:
             # The paper's prompt: trajectories as they are, whatever their lengths.
             self._lengths = [len(trajectory) for trajectory in trajectories]
             self.frames_: list[Frame] = [WORLD] * max(self._lengths)
-            self._prefix = "".join(
-                _sequence_input(points) + "".join(write_row(row) + "\n" for row in _world_rows(trajectory)) + "\n"
-                for points, trajectory in zip(keypoints, trajectories, strict=True)
-            )
+            self._keypoints = keypoints
+            self._write_sequences([_world_rows(trajectory) for trajectory in trajectories])
             return self
         aligned = align(trajectories)
-        keypoints = keypoints[list(aligned.kept)]
-        actions = aligned.actions
-        self._choose_frames(keypoints, actions, aligned.key_steps)
-        self._lengths = [actions.shape[1]]
-        numbers = np.stack([self._encode(points, own) for points, own in zip(keypoints, actions, strict=True)])
-        shown = np.stack([self._inputs(points) for points in keypoints])
+        self._keypoints = keypoints[list(aligned.kept)]
+        self._lengths = [aligned.actions.shape[1]]
+        self._choose_frames(aligned.actions, aligned.key_steps)
+        pairs = list(zip(self._keypoints, aligned.actions, strict=True))
+        numbers = np.stack([self._encode(points, actions) for points, actions in pairs])
         if self.layout == "sequence":
-            self._prefix = "".join(
-                _sequence_input(points) + "".join(write_row(row) + "\n" for row in np.round(rows)) + "\n"
-                for points, rows in zip(keypoints, numbers, strict=True)
-            )
+            self._write_sequences(list(np.round(numbers)))
         else:
+            shown = np.stack([self._inputs(points) for points in self._keypoints])
             self._centre = np.round(np.median(numbers, axis=0))
             blocks = _neighbours(self.frames_, STEPS_PER_QUERY)
             questions = (_ask(steps, numbers - self._centre, shown) for steps in blocks)
@@ -117,15 +119,24 @@ class InContextPrompt:
     def queries(self, keypoints: FloatArray) -> list[Query]:
         """What to ask for a scene with ``keypoints (K, 3)``: one query for sequences, one a step otherwise."""
         keypoints = self._checked(keypoints)
+        order = self._order(keypoints)
         if self.layout == "sequence":
             columns = ACTION_DIM * self._num_arms
-            rows = max(self._lengths)
-            text = self._prefix + _sequence_input(keypoints)
-            return [Query(text, max_tokens=rows * columns * TOKENS_PER_NUMBER, stop=("\n\n",), instruction=INSTRUCTION)]
+            form = (min(self._lengths), max(self._lengths), columns, range(STATE_INDEX, columns, ACTION_DIM))
+            return [
+                Query(
+                    "".join(self._examples[demo] for demo in order) + _sequence_input(keypoints),
+                    max_tokens=max(self._lengths) * columns * TOKENS_PER_NUMBER,
+                    grammar=rows_grammar(*form),
+                    pattern=rows_pattern(*form),
+                    stop=("\n\n",),
+                    instruction=INSTRUCTION,
+                )
+            ]
         inputs = self._inputs(keypoints)
         return [
             Query(
-                question.examples + _shown(inputs[question.step], question.inputs),
+                "".join(question.examples[demo] for demo in order) + _shown(inputs[question.step], question.inputs),
                 max_tokens=sum(question.digits) + 2 * len(question.digits) + 1,
                 grammar=row_grammar(question.digits),
                 pattern=row_pattern(question.digits),
@@ -166,10 +177,10 @@ class InContextPrompt:
     def _read(self, query_index: int, text: str) -> FloatArray | None:
         if self.layout == "factorised":
             question = self._questions[query_index]
-            lines = [line for line in text.splitlines() if line.strip()]
-            numbers = read_row(lines[0], len(question.asked)) if lines else None
-            if numbers is None or np.abs(numbers).max() > REACH_MM:
+            answer = read_rows(text, len(question.asked))
+            if answer is None or np.abs(answer[0]).max() > REACH_MM:
                 return None
+            numbers = answer[0]
             for (step, dim), number in zip(question.asked, numbers, strict=True):
                 if dim % ACTION_DIM == STATE_INDEX and number + self._centre[step, dim] not in (0, 1):
                     return None
@@ -183,13 +194,27 @@ class InContextPrompt:
             return None
         return rows[: max(self._lengths)]
 
-    def _choose_frames(self, keypoints: FloatArray, actions: FloatArray, key_steps: Sequence[int]) -> None:
+    def _write_sequences(self, rows: Sequence[np.ndarray]) -> None:
+        self._examples = [
+            _sequence_input(points) + "".join(write_row(row) + "\n" for row in own) + "\n"
+            for points, own in zip(self._keypoints, rows, strict=True)
+        ]
+
+    def _order(self, keypoints: FloatArray) -> list[int]:
+        """The demonstrations in the order in which they are shown."""
+        order = list(range(len(self._keypoints)))
+        if self.order == "nearest-last":
+            distances = np.linalg.norm(self._keypoints - keypoints, axis=-1).mean(axis=-1)
+            order.sort(key=lambda demo: -distances[demo])
+        return order
+
+    def _choose_frames(self, actions: FloatArray, key_steps: Sequence[int]) -> None:
         steps = actions.shape[1]
         if self.frames == "world":
             self.frames_ = [WORLD] * steps
             return
-        candidates = candidate_frames(keypoints)
-        poses = np.stack([np.stack([frame.pose(points) for points in keypoints]) for frame in candidates])
+        candidates = candidate_frames(self._keypoints)
+        poses = np.stack([np.stack([frame.pose(points) for points in self._keypoints]) for frame in candidates])
         triplets = actions.reshape(len(actions), steps, -1, ACTION_DIM)[..., :STATE_INDEX]
         chosen = choose_frames(candidates, poses, triplets.reshape(len(actions), steps, -1, 3), key_steps)
         self.frames_ = [candidates[index] for index in chosen]
@@ -258,11 +283,11 @@ def _ask(steps: Sequence[int], offsets: FloatArray, shown: FloatArray) -> _Quest
         varies = np.broadcast_to(~is_state, reach.shape)
     asked = tuple((step, int(dim)) for step in steps for dim in np.flatnonzero(varies[step]))
     if not asked:
-        return _Question(steps[0], (), (), (), "")
+        return _Question(steps[0], (), (), (), ())
     rows = np.stack([whole[:, step, dim] for step, dim in asked], axis=1)
     digits = tuple(max(1, len(str(round(1.5 * reach[step, dim])))) for step, dim in asked)
     inputs = _telling_inputs(shown[:, steps[0]], rows)
-    examples = "".join(
+    examples = tuple(
         _shown(points, inputs) + write_row(row) + "\n" for points, row in zip(shown[:, steps[0]], rows, strict=True)
     )
     return _Question(steps[0], asked, digits, inputs, examples)
