@@ -59,16 +59,12 @@ class CellEnv(BaseEnv):
         down, left, up = (0, 0, -1), (0, 1, 0), (1, 0, 0)
         pose = sapien.Pose(make_pose(np.stack([down, left, up], axis=1), CAMERA_POSITION_M))
         fov = 2 * np.arctan2(CAMERA_VIEW_M / 2, CAMERA_POSITION_M[2])
-        return [
-            CameraConfig("top", pose, CAMERA_PIXELS, CAMERA_PIXELS, fov=fov, near=0.05, far=5.0, shader_pack="default")
-        ]
+        return [CameraConfig("top", pose, CAMERA_PIXELS, CAMERA_PIXELS, fov=fov, near=0.05, far=5.0)]
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
         pose = sapien_utils.look_at(eye=(-0.22, -0.95, 0.72), target=(-0.1, 0.04, 0.16))
-        return CameraConfig(
-            "render_camera", pose, VIDEO_WIDTH, VIDEO_HEIGHT, fov=0.95, near=0.05, far=20.0, shader_pack="default"
-        )
+        return CameraConfig("render_camera", pose, VIDEO_WIDTH, VIDEO_HEIGHT, fov=0.95, near=0.05, far=20.0)
 
     def _load_agent(self, options: dict) -> None:
         super()._load_agent(options, sapien.Pose(p=BASE_POSITION_M))
