@@ -188,11 +188,11 @@ def _fit(data: Candidates, dof: float, unit: str, groups: FloatArray) -> _Part:
     state = model.start()
     if np.isfinite(dof):
         for _ in range(DRAFT_ITERATIONS):
-            state, _ = model.improve(state)
+            state = model.improve(state)[0]
         if unit != "trajectory":
             model.leave_out_stretches(state)
             for _ in range(REDRAFT_ITERATIONS):
-                state, _ = model.improve(state)
+                state = model.improve(state)[0]
         model.choose_stiffness(state)
         model.scale_is_free = False
     state, trace = model.maximise(state)
@@ -241,38 +241,36 @@ class _Model:
 
     def _distance(self, squares: FloatArray, state: _State) -> FloatArray:
         """Mean squared distance δ² ``(N,)`` over the numbers that share one u."""
-        distance = squares @ (1 / (state.squared_scale * len(state.squared_scale)))
-        distance /= self.basis.spread(state.profile)
+        distance = _mean_square(squares, state.squared_scale) / self.basis.spread(state.profile)
         if self.unit == "trajectory":
             lengths = self.data.lengths
             distance = np.repeat(np.add.reduceat(distance, self.data.starts[:-1]) / lengths, lengths)
         return distance
 
-    def improve(self, state: _State) -> tuple[_State, float]:
-        """One iteration; also the log-likelihood of the ``state`` it began with."""
+    def improve(self, state: _State) -> tuple[_State, FloatArray, FloatArray]:
+        """One iteration; also the distances and accelerations that the likelihood of ``state`` is made of."""
         values, basis = self.data.values, self.basis
         squares = self._squares(state)
         distance = self._distance(squares, state)
         acceleration = self._acceleration(state)
-        reached = self._log_likelihood(distance, acceleration, state)
         weights = self.trust * expected_precision(distance, self.dof)
         squared_scale = state.squared_scale
         if self.scale_is_free:
-            spread = (weights / basis.spread(state.profile)) @ squares
+            spread = np.einsum("n,nd->d", weights / basis.spread(state.profile), squares)
             squared_scale = self.groups @ spread / self._total + self._floor
-        shared = basis.gather(weights * (squares @ (1 / (squared_scale * len(squared_scale)))))
+        shared = basis.gather(weights * _mean_square(squares, squared_scale))
         profile = (shared + PRIOR_SAMPLES) / (self._per_knot + PRIOR_SAMPLES)
         precision = weights / basis.spread(profile)
         bands = basis.normal_matrix(precision) + self._price_matrix(acceleration)
         curve = solve_banded(bands, basis.project(precision, values))
-        return _State(curve, squared_scale, profile), reached
+        return _State(curve, squared_scale, profile), distance, acceleration
 
     def maximise(self, state: _State) -> tuple[_State, list[float]]:
         """Iterate until nothing is gained; returns the log-likelihood of every iteration."""
         trace: list[float] = []
         while len(trace) < MAX_ITERATIONS:
-            improved, reached = self.improve(state)
-            trace.append(reached)
+            improved, distance, acceleration = self.improve(state)
+            trace.append(self._log_likelihood(distance, acceleration, state))
             if len(trace) > 1 and trace[-1] - trace[-2] < TOLERANCE * self.data.values.size:
                 break
             state = improved
@@ -362,7 +360,7 @@ class _Model:
         """Mean squared acceleration ``(K-2,)``, in scales."""
         if not self.roughness.count:
             return np.zeros(0)
-        return (self.roughness(state.curve) ** 2) @ (1 / (state.squared_scale * len(state.squared_scale)))
+        return _mean_square(self.roughness(state.curve) ** 2, state.squared_scale)
 
     def _price_matrix(self, acceleration: FloatArray) -> FloatArray:
         if not self.roughness.count:
@@ -379,7 +377,7 @@ class _Model:
             lengths, firsts = self.data.lengths, self.data.starts[:-1]
             total = log_density(distance[firsts], np.zeros(len(lengths)), self.dof, dimension * lengths).sum()
         else:
-            total = self.trust @ log_density(distance, np.zeros_like(distance), self.dof, dimension)
+            total = (self.trust * log_density(distance, np.zeros_like(distance), self.dof, dimension)).sum()
         total -= 0.5 * dimension * (self._per_knot @ log_profile)
         total -= 0.5 * self._total * (np.log(state.squared_scale) + self._floor / state.squared_scale).sum()
         total -= 0.5 * PRIOR_SAMPLES * dimension * (log_profile + 1 / state.profile).sum()
@@ -388,6 +386,12 @@ class _Model:
         elif not self.basis.on_knots:
             total -= 0.5 * dimension * FAINT * acceleration.sum()
         return float(total)
+
+
+def _mean_square(squares: FloatArray, squared_scale: FloatArray) -> FloatArray:
+    """Mean over the dimensions ``(N,)`` of ``squares (N, D)`` in units of ``squared_scale (D,)``."""
+    # einsum, because products this thin are slower on several cores than on one
+    return np.einsum("nd,d->n", squares, 1 / (squared_scale * len(squared_scale)))
 
 
 def _pooled(rows: FloatArray) -> FloatArray:
