@@ -14,12 +14,14 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception.cloud import foreground
 from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.objects import MovingObject, Registration, View, moving_objects
-from robust_instant_policy.perception.registration import NEAR_M
+from robust_instant_policy.perception.registration import NEAR_M, local_shift
 from robust_instant_policy.perception.selection import lifted, select
 from robust_instant_policy.perception.settings import PAPER_SIMULATION, DescriptorSettings
 
 MIN_FIT = 0.15  # share of an object's points that must be explained in every demonstration
 MIN_OBJECT_POINTS = 25
+SAME_SHAPE = 0.7  # fit from which an object is the reference's own shape, so that keypoints need no following
+PATCH_M = 0.04  # around a keypoint that must match for it to follow
 OFF_CENTRE = 0.4  # of half the image; no lens is mounted that far off
 
 
@@ -121,6 +123,13 @@ class KeypointExtractor:
         """The keypoints of objects that were found in ``view``."""
         poses = np.stack([registrations[number].pose for number in self._owner])
         expected = (poses[:, :3, :3] @ self._places[..., None])[..., 0] + poses[:, :3, 3]
+        for k, number in enumerate(self._owner):
+            if registrations[number].fit < SAME_SHAPE:
+                template = self._objects[number].templates[0].painted
+                patch = template[np.linalg.norm(template[:, :3] - self._places[k], axis=1) < PATCH_M]
+                near = view.painted[np.linalg.norm(view.painted[:, :3] - expected[k], axis=1) < 2 * PATCH_M]
+                if len(near):
+                    expected[k] += local_shift(poses[k], patch, near)
         points, pixels, hanging = lifted(view, expected)
         belief = np.array([(r.fit + r.agreement) / 2 for r in registrations])[self._owner]
         confidence = belief * np.exp(-(((points - expected) ** 2).sum(axis=1)) / NEAR_M**2)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.perception.descriptors import Float32Array
 
 TURN_BINS = 36
@@ -30,6 +30,7 @@ OPINION_SCALE = 0.01  # of the agreement; how much a worse turn counts
 COARSE_POINTS = 60
 FINALISTS = 3
 COARSE_REACH_M = (0.06, 0.05, 0.04, 0.03, 0.025, 0.02, 0.02, 0.02)
+PATCH_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
 FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
 
 
@@ -162,3 +163,20 @@ def closest_points(
 def painted(points: FloatArray, colours: Float32Array) -> Float32Array:
     """Points with their colours ``(N, 6)``, all in metres."""
     return np.concatenate([points, colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
+
+
+def local_shift(pose: FloatArray, patch: Float32Array, target: Float32Array) -> FloatArray:
+    """Shift ``(3,)`` that brings a ``patch (N, 6)`` of an object, at ``pose``, onto the image's nearest points.
+
+    One way only and without turning: what an even surface does not tell (how far along it) stays as it was, while
+    edges, handles and tips of an object of another size are followed.
+    """
+    moved = transform_points(pose, patch[:, :3].astype(np.float64))
+    paint = ((patch[:, None, 3:] - target[:, 3:]) ** 2).sum(axis=2).clip(max=COLOUR_CAP_M**2)
+    shift = np.zeros(3)
+    for reach in PATCH_REACH_M:
+        costs = (((moved + shift)[:, None] - target[:, :3]) ** 2).sum(axis=2) + paint
+        nearest = costs.argmin(axis=1)
+        weights = np.exp(-costs[np.arange(len(moved)), nearest] / reach**2) + 1e-9
+        shift = shift + weights @ (target[nearest, :3] - moved - shift) / weights.sum()
+    return shift
