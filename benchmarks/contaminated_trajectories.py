@@ -7,7 +7,7 @@ Trajectories are functions of normalised time, so that candidates of different l
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -242,3 +242,16 @@ def draw_scene(seed: int, style: str, num_candidates: int, num_hallucinated: int
                 break
         candidates.append(_noisy(rng, actions, level))
     return Scene(truth, candidates, hallucinated, np.zeros(num_candidates, dtype=np.intp), (truth,))
+
+
+def draw_single_steps(seed: int, style: str, num_candidates: int, rate: float) -> Scene:
+    """A scene in which any step of any candidate is off with probability ``rate``, independently."""
+    scene = draw_scene(seed, style, num_candidates, 0)
+    rng = np.random.default_rng([seed, num_candidates, round(rate * 100), len(style)])
+    candidates = []
+    for candidate in scene.candidates:
+        actions = candidate.copy()
+        for step in np.flatnonzero(rng.random(len(actions)) < rate):
+            actions[step, :9] += np.tile(_direction(rng) * rng.uniform(0.03, 0.10), 3)
+        candidates.append(actions)
+    return replace(scene, candidates=candidates)
