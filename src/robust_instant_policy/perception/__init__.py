@@ -1,6 +1,18 @@
 """RGB-D images to 3-D keypoints that all demonstrations share."""
 
+from robust_instant_policy.perception.accuracy import Accuracy, KnownScene, measure
 from robust_instant_policy.perception.keypoints import KeypointExtractor, Located
+from robust_instant_policy.perception.page import keypoints_page
 from robust_instant_policy.perception.settings import PAPER_REAL, PAPER_SIMULATION, DescriptorSettings
 
-__all__ = ["PAPER_REAL", "PAPER_SIMULATION", "DescriptorSettings", "KeypointExtractor", "Located"]
+__all__ = [
+    "PAPER_REAL",
+    "PAPER_SIMULATION",
+    "Accuracy",
+    "DescriptorSettings",
+    "KeypointExtractor",
+    "KnownScene",
+    "Located",
+    "keypoints_page",
+    "measure",
+]

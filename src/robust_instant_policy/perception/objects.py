@@ -21,9 +21,6 @@ SAME_OBJECT_M = 0.025  # points of an image this near to where the object was fo
 TEMPLATES_TRIED = 2
 BEST_VIEWS = 3  # demonstrations whose descriptors judge a motion
 BUDDY_PATCHES = 2.0  # distance from its place within which a best buddy is one
-STRAY_M = 0.012  # from its place in another image at which a point does not move with its object,
-STRAY_SHARE = 0.4  # if that is so in this share of the images
-MIN_PART = 0.08  # share of an object's points that makes a part of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,17 +130,11 @@ class MovingObject:
         pairs = zip(views, self.registrations, strict=True)
         return np.stack([cKDTree(v.cloud.points).query(transform_points(r.pose, points))[0] for v, r in pairs])
 
-    def strays(self, views: Sequence[View]) -> IntArray:
-        """Points of the first template that do not move with the rest, if there are enough to be a part themselves."""
-        points = self.templates[0].painted[:, :3].astype(np.float64)
-        stray = np.flatnonzero((self.residuals(views, points) > STRAY_M).mean(axis=0) > STRAY_SHARE)
-        return stray if len(stray) >= MIN_PART * len(points) else stray[:0]
-
     def buddies(self, views: Sequence[View], points: FloatArray) -> FloatArray:
         """Share ``(N,)`` of ``views`` in which each of ``points (N, 3)`` has a best buddy near its place.
 
-        Two descriptors are best buddies if each is the other's nearest neighbour (Amir et al. 2022); near is within
-        two patches, and the points are places in the first view.
+        Two descriptors are best buddies if each is the other's nearest neighbour (Amir et al. 2022). The points are
+        places in the first view.
         """
         home = views[0]
         cells = home.cells[: len(home.cell_points)]
@@ -194,7 +185,7 @@ class MovingObject:
 
 
 def moving_objects(views: Sequence[View], min_points: int, seed: int) -> list[MovingObject]:
-    """The objects of the first view, each connected piece of it, and each part of a piece that moves by itself."""
+    """The connected pieces of the first view that are large enough, found in all the others."""
     cloud = views[0].cloud
     result = []
     for piece in np.unique(cloud.pieces):
@@ -204,13 +195,7 @@ def moving_objects(views: Sequence[View], min_points: int, seed: int) -> list[Mo
         ]
         if len(points) < min_points:
             continue
-        whole = MovingObject(views, points, seed)
-        strays = whole.strays(views)
-        if min_points <= len(strays) <= len(points) - min_points:
-            rest = np.setdiff1d(np.arange(len(points)), strays)
-            result += [MovingObject(views, points[rest], seed), MovingObject(views, points[strays], seed)]
-        else:
-            result.append(whole)
+        result.append(MovingObject(views, points, seed))
     return result
 
 
