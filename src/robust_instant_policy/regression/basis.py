@@ -15,6 +15,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression.alignment import Candidates
 
 BANDS = 3  # diagonal and two below it: what accelerations couple
+FAINT = 1e-6  # stiffness that only ties down knots between which no candidate has a sample
 
 
 class HatBasis:

@@ -27,9 +27,11 @@ from scipy.special import gammaln, stdtrit
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression.alignment import Candidates, checked_dof
-from robust_instant_policy.regression.basis import HatBasis, Roughness, multiply_banded, solve_banded
-from robust_instant_policy.regression.diagnosis import MIN_FREEDOM, effective_count, error_freedom
+from robust_instant_policy.regression.basis import BANDS, FAINT, HatBasis, Roughness, solve_banded
+from robust_instant_policy.regression.diagnosis import error_freedom
+from robust_instant_policy.regression.smoothing import choose_stiffness
 from robust_instant_policy.regression.switching import persistent
+from robust_instant_policy.regression.uncertainty import squared_error
 
 DEFAULT_DOF = 1.5  # the paper's ν
 UNITS = ("step", "trajectory", "number")
@@ -46,15 +48,7 @@ STANDS_OUT = 0.7  # -log w of a step from which it speaks against its candidate:
 STRETCH_COST = 1.0  # such evidence needed to begin or end a stretch that is left out
 LEFT_OUT = 1e-3  # weight of a sample in such a stretch; not 0, so that a step where all stand out still has a mean
 
-STIFFNESSES = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0])  # prices on squared acceleration, in 1/σ²
 CORNER_DOF = 2.0  # accelerations are Student-t as well: most steps go straight, some turn sharply and stay sharp
-MIN_SLOPE = 0.2  # curvature of the likelihood, against w, that is still believed when errors are estimated
-ALONE = 1.5  # effective candidates below which a step is decided by one, whose error nobody can see: it gets the scale
-POOLED_STEPS = 2  # neighbours on either side over which errors are averaged
-
-CORNER_SWEEPS = 2  # reweightings of the accelerations at each stiffness tried
-FAINT = 1e-6  # stiffness that only ties down knots between which no candidate has a sample
-NEARLY_GAUSSIAN_DOF = 30.0  # from here on smoothing fades, so that ν → ∞ is the mean of the candidates
 
 
 def log_density(distance: FloatArray, log_scale: FloatArray, dof: float, shared: int | FloatArray = 1) -> FloatArray:
@@ -145,7 +139,7 @@ class StudentTRegression:
     def _error(self) -> tuple[FloatArray, FloatArray]:
         if len(self.weights) == 1:
             return np.full_like(self.mean(), np.inf), np.ones(len(self.knots))
-        errors, deciding = zip(*[part.model.squared_error(part.state) for part in self._parts], strict=True)
+        errors, deciding = zip(*[squared_error(part.model, part.state) for part in self._parts], strict=True)
         return np.hstack(errors), np.mean(deciding, axis=0)
 
     def _evaluate(self, values: FloatArray, times: ArrayLike | None) -> FloatArray:
@@ -167,7 +161,7 @@ class StudentTRegression:
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
+class State:
     """What expectation-maximisation improves: the curve ``(K, D)`` and the squared scale, ``(D,)`` times ``(K,)``."""
 
     curve: FloatArray
@@ -178,13 +172,13 @@ class _State:
 class _Part(NamedTuple):
     """The dimensions that were fitted together."""
 
-    model: _Model
-    state: _State
+    model: PenalisedLikelihood
+    state: State
     trace: list[float]
 
 
 def _fit(data: Candidates, dof: float, unit: str, groups: FloatArray) -> _Part:
-    model = _Model(data, dof, unit, groups)
+    model = PenalisedLikelihood(data, dof, unit, groups)
     state = model.start()
     if np.isfinite(dof):
         for _ in range(DRAFT_ITERATIONS):
@@ -193,13 +187,13 @@ def _fit(data: Candidates, dof: float, unit: str, groups: FloatArray) -> _Part:
             model.leave_out_stretches(state)
             for _ in range(REDRAFT_ITERATIONS):
                 state = model.improve(state)[0]
-        model.choose_stiffness(state)
+        model.stiffness = choose_stiffness(model, state)
         model.scale_is_free = False
     state, trace = model.maximise(state)
     return _Part(model, state, trace)
 
 
-class _Model:
+class PenalisedLikelihood:
     """The penalised likelihood of one set of candidates."""
 
     def __init__(self, data: Candidates, dof: float, unit: str, groups: FloatArray):
@@ -215,7 +209,7 @@ class _Model:
         self._total = self.trust.sum()
         self._per_knot = self.basis.gather(self.trust)
 
-    def start(self) -> _State:
+    def start(self) -> State:
         """A curve near the densest candidates, and a scale from what half of them agree on."""
         blocks = self.data.at(self.basis.knots)
         median = np.median(blocks, axis=0)
@@ -229,30 +223,33 @@ class _Model:
             # the diagonal is taken out: a candidate does not support itself
             support = expected_precision(gaps / 2, self.dof).sum(axis=1) - (self.dof + 1) / self.dof
             curve = np.einsum("qk,qkd->kd", support / support.sum(axis=0), blocks)
-        return _State(curve, squared, np.ones(len(self.basis.knots)))
+        return State(curve, squared, np.ones(len(self.basis.knots)))
 
-    def weights(self, state: _State) -> FloatArray:
+    def weights(self, state: State) -> FloatArray:
         """E-step: expected precision ``(N,)`` of every sample, times the trust in it."""
-        return self.trust * expected_precision(self._distance(self._squares(state), state), self.dof)
+        return self.trust * expected_precision(self.distance(state), self.dof)
 
-    def _squares(self, state: _State) -> FloatArray:
+    def distance(self, state: State) -> FloatArray:
+        """Mean squared distance δ² ``(N,)`` over the numbers that share one u."""
+        return self._distance(self._squares(state), state)
+
+    def _squares(self, state: State) -> FloatArray:
         residuals = self.basis.residuals(self.data.values, state.curve)
         return np.multiply(residuals, residuals, out=residuals)
 
-    def _distance(self, squares: FloatArray, state: _State) -> FloatArray:
-        """Mean squared distance δ² ``(N,)`` over the numbers that share one u."""
+    def _distance(self, squares: FloatArray, state: State) -> FloatArray:
         distance = _mean_square(squares, state.squared_scale) / self.basis.spread(state.profile)
         if self.unit == "trajectory":
             lengths = self.data.lengths
             distance = np.repeat(np.add.reduceat(distance, self.data.starts[:-1]) / lengths, lengths)
         return distance
 
-    def improve(self, state: _State) -> tuple[_State, FloatArray, FloatArray]:
+    def improve(self, state: State) -> tuple[State, FloatArray, FloatArray]:
         """One iteration; also the distances and accelerations that the likelihood of ``state`` is made of."""
         values, basis = self.data.values, self.basis
         squares = self._squares(state)
         distance = self._distance(squares, state)
-        acceleration = self._acceleration(state)
+        acceleration = self.acceleration(state)
         weights = self.trust * expected_precision(distance, self.dof)
         squared_scale = state.squared_scale
         if self.scale_is_free:
@@ -261,11 +258,11 @@ class _Model:
         shared = basis.gather(weights * _mean_square(squares, squared_scale))
         profile = (shared + PRIOR_SAMPLES) / (self._per_knot + PRIOR_SAMPLES)
         precision = weights / basis.spread(profile)
-        bands = basis.normal_matrix(precision) + self._price_matrix(acceleration)
+        bands = basis.normal_matrix(precision) + self.price_matrix(acceleration, self.stiffness)
         curve = solve_banded(bands, basis.project(precision, values))
-        return _State(curve, squared_scale, profile), distance, acceleration
+        return State(curve, squared_scale, profile), distance, acceleration
 
-    def maximise(self, state: _State) -> tuple[_State, list[float]]:
+    def maximise(self, state: State) -> tuple[State, list[float]]:
         """Iterate until nothing is gained; returns the log-likelihood of every iteration."""
         trace: list[float] = []
         while len(trace) < MAX_ITERATIONS:
@@ -276,12 +273,12 @@ class _Model:
             state = improved
         return state, trace
 
-    def leave_out_stretches(self, state: _State) -> None:
+    def leave_out_stretches(self, state: State) -> None:
         """Distrust the stretches in which a candidate stands out: a hallucination is no matter of one number.
 
         Evidence is -log w, so that nothing is left out where ν → ∞ and no sample is doubted.
         """
-        evidence = -np.log(expected_precision(self._distance(self._squares(state), state), self.dof)) - STANDS_OUT
+        evidence = -np.log(expected_precision(self.distance(state), self.dof)) - STANDS_OUT
         lengths = self.data.lengths
         steps = np.arange(lengths.max())
         ragged = np.full((len(self.data), len(steps)), -np.inf)
@@ -290,86 +287,27 @@ class _Model:
         self.trust = np.where(out, LEFT_OUT, 1.0)
         self._count_trust()
 
-    def choose_stiffness(self, state: _State) -> None:
-        """Choose the price on accelerations whose curve is expected to lie closest to the truth.
-
-        Smoothing by S moves the unsmoothed curve ȳ, whose error has covariance C; the expected squared error of Sȳ is
-        |Sȳ - ȳ|² + 2 tr(S C) up to a constant (Mallows' Cp). C is measured as the scatter of what each candidate
-        contributes to ȳ, so that errors that wander along a candidate are not taken for detail of the curve.
-        """
-        if len(self.data) < 2 or not self.roughness.count:
-            return
-        unit = np.sqrt(state.squared_scale)
-        normal, pulls = self.pulls(state)
-        pulls = np.asfortranarray((pulls / unit).reshape(len(normal[0]), -1))
-        target = multiply_banded(normal, state.curve)
-        smooth = state
-        inflation = 2 * len(self.data) / (len(self.data) - 1)
-        best, choice = np.inf, 0.0
-        for stiffness in (0.0, *STIFFNESSES * min(1.0, NEARLY_GAUSSIAN_DOF / self.dof) ** 2):
-            self.stiffness = stiffness
-            for _ in range(CORNER_SWEEPS):
-                bands = normal + self._price_matrix(self._acceleration(smooth))
-                smooth = replace(smooth, curve=solve_banded(bands, target))
-            moved = (smooth.curve - state.curve) / unit
-            risk = (moved * multiply_banded(normal, moved)).sum()
-            risk += inflation * (pulls * solve_banded(bands, pulls)).sum()
-            if risk < best:
-                best, choice = risk, stiffness
-        self.stiffness = choice
-
-    def pulls(self, state: _State) -> tuple[FloatArray, FloatArray]:
+    def pulls(self, state: State) -> tuple[FloatArray, FloatArray]:
         """Normal matrix ``(3, K)`` of the fit, and how hard each candidate pulls at the curve ``(K, Q, D)``."""
         precision = self.weights(state) / self.basis.spread(state.profile)
         residuals = self.basis.residuals(self.data.values, state.curve)
         return self.basis.normal_matrix(precision), self.basis.project_each(precision, residuals)
 
-    def squared_error(self, state: _State) -> tuple[FloatArray, FloatArray]:
-        """Expected squared error of the curve ``(K, D)``, and the number of candidates ``(K,)`` that decide it.
-
-        The scatter of the candidates' pulls, each as a whole, so that errors that wander along a candidate count in
-        full; plus what smoothing moved the curve beyond what it took out of that scatter, its bias. A residual shows
-        less than the error: the mean of n candidates moves with each of them (n - 1) / n; and moves more than w says,
-        because w falls with the residual: the curvature of the likelihood is w (1 - 2/p · δ² / (ν + δ²)).
-        """
-        distance = self._distance(self._squares(state), state)
-        weights = self.trust * expected_precision(distance, self.dof)
-        shared = len(state.squared_scale) * (self.data.lengths.mean() if self.unit == "trajectory" else 1)
-        slope = 1 - 2 / shared * (weights @ (distance / (self.dof + distance))) / weights.sum()
-        by_candidate = self.basis.project_each(weights, np.ones((len(weights), 1)))[:, :, 0]
-        deciding = effective_count(by_candidate.T)
-        inflation = deciding / np.maximum(deciding - 1, MIN_FREEDOM) / max(slope, MIN_SLOPE) ** 2
-
-        normal, pulls = self.pulls(state)
-        flat = pulls.reshape(len(pulls), -1)
-        bands = normal + self._price_matrix(self._acceleration(state))
-        smoothed = solve_banded(bands, flat).reshape(pulls.shape)
-        error = inflation[:, None] * (smoothed**2).sum(axis=1)
-        if self.stiffness:
-            faint = normal + self.roughness.matrix(np.full(self.roughness.count, FAINT))
-            unsmoothed = solve_banded(faint, flat).reshape(pulls.shape)
-            moved = solve_banded(faint, pulls.sum(axis=1)) ** 2
-            removed = inflation[:, None] * ((unsmoothed - smoothed) ** 2).sum(axis=1)
-            error += np.maximum(_pooled((moved - removed) @ self.groups), 0.0)
-        error = _pooled(error @ self.groups)
-        alone = deciding < ALONE
-        error[alone] += (state.profile[:, None] * state.squared_scale)[alone]
-        return error, deciding
-
-    def _acceleration(self, state: _State) -> FloatArray:
+    def acceleration(self, state: State) -> FloatArray:
         """Mean squared acceleration ``(K-2,)``, in scales."""
         if not self.roughness.count:
             return np.zeros(0)
         return _mean_square(self.roughness(state.curve) ** 2, state.squared_scale)
 
-    def _price_matrix(self, acceleration: FloatArray) -> FloatArray:
+    def price_matrix(self, acceleration: FloatArray, stiffness: float) -> FloatArray:
+        """What accelerations cost, as lower bands ``(3, K)``: little where there already is a corner."""
         if not self.roughness.count:
-            return np.zeros((3, 1))
-        if self.stiffness:
-            return self.roughness.matrix(self.stiffness * expected_precision(self.stiffness * acceleration, CORNER_DOF))
+            return np.zeros((BANDS, 1))
+        if stiffness:
+            return self.roughness.matrix(stiffness * expected_precision(stiffness * acceleration, CORNER_DOF))
         return self.roughness.matrix(np.full(self.roughness.count, 0.0 if self.basis.on_knots else FAINT))
 
-    def _log_likelihood(self, distance: FloatArray, acceleration: FloatArray, state: _State) -> float:
+    def _log_likelihood(self, distance: FloatArray, acceleration: FloatArray, state: State) -> float:
         """Log-likelihood of the candidates plus that of scales and accelerations under their priors."""
         dimension = len(state.squared_scale)
         log_profile = np.log(state.profile)
@@ -392,11 +330,3 @@ def _mean_square(squares: FloatArray, squared_scale: FloatArray) -> FloatArray:
     """Mean over the dimensions ``(N,)`` of ``squares (N, D)`` in units of ``squared_scale (D,)``."""
     # einsum, because products this thin are slower on several cores than on one
     return np.einsum("nd,d->n", squares, 1 / (squared_scale * len(squared_scale)))
-
-
-def _pooled(rows: FloatArray) -> FloatArray:
-    """Means ``(K, D)`` of ``rows (K, D)`` over each one and its neighbours."""
-    sums = np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(rows, axis=0)])
-    index = np.arange(len(rows))
-    last, first = np.minimum(index + POOLED_STEPS + 1, len(rows)), np.maximum(index - POOLED_STEPS, 0)
-    return (sums[last] - sums[first]) / (last - first)[:, None]
