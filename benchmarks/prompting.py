@@ -2,20 +2,33 @@
 
 A synthetic pick-and-place: two objects, each turned and placed at random, five keypoints on each, measured with
 noise; the gripper grasps the first object in its own frame and sets it down in the frame of the second. Ten
-demonstrations, then scenes that were not shown.
+demonstrations, then scenes that were not shown. The error is the largest distance of any of the three gripper points
+from where it belongs, at any key step: start, both sides of the grasp and of the release, end.
 
-    python benchmarks/prompting.py --scenes 20
+    python benchmarks/prompting.py --nearest-last --out docs/tables/prompting.md
 """
 
 from __future__ import annotations
 
+import argparse
+import os
+import time
+from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
+from robust_instant_policy.context import InContextPrompt
+from robust_instant_policy.context.prompt import Frames, Layout, Order
 from robust_instant_policy.geometry import FloatArray, GripperTriangle, interpolate_poses, make_pose
+from robust_instant_policy.llm import connect
+from robust_instant_policy.regression import robust_gripper_trajectory
 from robust_instant_policy.trajectory import Trajectory, downsample
 
+NUM_DEMOS = 10
+MIN_CANDIDATES = 3
 TRIANGLE = GripperTriangle(length=0.10, opening=0.08)
 KEYPOINT_NOISE_M = 0.002
 HAND_NOISE_M = 0.002  # of a demonstrator's waypoints
@@ -37,8 +50,7 @@ class PickAndPlace:
 
     def __init__(self, seed: int = 0):
         rng = np.random.default_rng(seed)
-        spread = np.array([0.04, 0.04, 0.015])
-        self.shapes = rng.uniform(-spread, spread, (2, 5, 3)) + [0, 0, 0.015]
+        self.shapes = rng.uniform([-0.04, -0.04, 0.0], [0.04, 0.04, 0.03], (2, 5, 3))
         self.grasp = _down(rng.uniform(-0.01, 0.01, 2), 0.02, rng.uniform(-0.5, 0.5))
         self.place = _down(rng.uniform(-0.01, 0.01, 2), 0.05, rng.uniform(-0.5, 0.5))
 
@@ -54,8 +66,9 @@ class PickAndPlace:
             [shape @ pose[:3, :3].T + pose[:3, 3] for shape, pose in zip(self.shapes, objects, strict=True)]
         )
         keypoints = keypoints + rng.normal(0, KEYPOINT_NOISE_M, keypoints.shape)
-        hand = (lambda pose: pose) if exact else (lambda pose: _shaken(pose, rng))
-        grasp, place = hand(objects[0] @ self.grasp), hand(objects[1] @ self.place)
+        grasp, place = objects[0] @ self.grasp, objects[1] @ self.place
+        if not exact:
+            grasp, place = _shaken(grasp, rng), _shaken(place, rng)
         ways = [
             (HOME, 0),
             (_raised(grasp, 0.10), 0),
@@ -72,7 +85,7 @@ class PickAndPlace:
 
 def _played(ways: list[tuple[FloatArray, int]], rng: np.random.Generator) -> Trajectory:
     poses, states = [ways[0][0][None]], [np.array([ways[0][1]])]
-    for (start, _), (stop, state) in zip(ways[:-1], ways[1:], strict=True):
+    for (start, _), (stop, state) in pairwise(ways):
         count = max(2, round(np.linalg.norm(stop[:3, 3] - start[:3, 3]) / 0.005 * rng.uniform(0.8, 1.25)))
         poses.append(interpolate_poses([0, 1], np.stack([start, stop]), np.arange(1, count + 1) / count))
         states.append(np.full(count, state))
@@ -110,3 +123,171 @@ def key_error(trajectory: Trajectory, truth: Trajectory) -> float:
     if len(own) != len(true):
         return float("inf")
     return float(np.linalg.norm(trajectory.triplets[own] - truth.triplets[true], axis=-1).max())
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: a way of asking."""
+
+    model: str
+    frames: Frames
+    layout: Layout
+    order: Order = "given"
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Key-step errors in metres (infinite where no plan came) and what the plans cost."""
+
+    single: FloatArray
+    gaussian: FloatArray
+    robust: FloatArray
+    refused: int
+    answers: int
+    tokens: list[int]  # read (not from a cache) and written, of each plan
+    seconds: list[float]
+    cpu_seconds: list[float]
+
+
+def measure(row: Row, world: PickAndPlace, scenes: int, args: argparse.Namespace) -> Outcome:
+    demos = [world.scene(seed) for seed in range(NUM_DEMOS)]
+    prompt = InContextPrompt(row.frames, row.layout, row.order)
+    prompt.fit(np.stack([demo.keypoints for demo in demos]), [demo.trajectory for demo in demos])
+    model = connect(row.model)
+    counts: Counter[bool] = Counter()
+    single, gaussian, robust = [], [], []
+    tokens, seconds, cpu_seconds = [], [], []
+    for number in range(scenes):
+        scene = world.scene(1000 + number, exact=True)
+        start, cpu = time.monotonic(), time.process_time()
+        answers = model.sample(
+            prompt.queries(scene.keypoints),
+            args.samples,
+            temperature=args.temperature,
+            seed=number,
+            deadline_s=args.deadline,
+            accept=prompt.accepts,
+            on_answer=lambda query, sample, attempt, answer, accepted: counts.update([accepted]),
+        )
+        seconds.append(time.monotonic() - start)
+        cpu_seconds.append(time.process_time() - cpu)
+        every = [answer for own in answers for answer in own]
+        tokens.append(sum(one.prompt_tokens - one.cached_tokens + one.completion_tokens for one in every))
+        candidates = [
+            prompt.trajectory([own[index].text for own in answers], scene.keypoints)
+            for index in range(min(map(len, answers)))
+        ]
+        single += [key_error(candidate, scene.trajectory) for candidate in candidates]
+        single += [float("inf")] * (args.samples - len(candidates))
+        for results, dof in ((gaussian, float("inf")), (robust, 1.5)):
+            if len(candidates) < MIN_CANDIDATES:
+                results.append(float("inf"))
+            else:
+                fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof)
+                results.append(key_error(Trajectory.from_actions(fit.actions), scene.trajectory))
+    model.close()
+    return Outcome(
+        np.array(single),
+        np.array(gaussian),
+        np.array(robust),
+        counts[False],
+        counts.total(),
+        tokens,
+        seconds,
+        cpu_seconds,
+    )
+
+
+def as_line(row: Row, outcome: Outcome) -> str:
+    def cost(values: list[float], form: str) -> str:
+        later = f"{np.median(values[1:]):{form}}" if len(values) > 1 else "—"
+        return f"{values[0]:{form}} / {later}"
+
+    name = row.model if row.model == "embedded" else Path(row.model.removeprefix("gguf:")).stem
+    cells = (
+        name + (", nearest last" if row.order == "nearest-last" else ""),
+        f"{row.frames}, {row.layout}",
+        str(len(outcome.robust)),
+        _errors(outcome.single),
+        _errors(outcome.gaussian),
+        _errors(outcome.robust),
+        f"{outcome.refused / max(outcome.answers, 1):.0%}",
+        cost([float(value) for value in outcome.tokens], ".0f"),
+        cost(outcome.seconds, ".1f"),
+        cost(outcome.cpu_seconds, ".1f"),
+    )
+    return "| " + " | ".join(cells) + " |"
+
+
+def reference_line(world: PickAndPlace, scenes: int) -> str:
+    """What the frames give without any model: every number the demonstrations' median."""
+    demos = [world.scene(seed) for seed in range(NUM_DEMOS)]
+    prompt = InContextPrompt().fit(np.stack([demo.keypoints for demo in demos]), [demo.trajectory for demo in demos])
+    errors = []
+    for number in range(scenes):
+        scene = world.scene(1000 + number, exact=True)
+        errors.append(key_error(prompt.median_trajectory(scene.keypoints), scene.trajectory))
+    cells = ("none: the demonstrations' median", "adaptive, factorised", str(scenes), _errors(np.array(errors)))
+    return "| " + " | ".join([*cells, *[""] * (len(COLUMNS) - len(cells))]) + " |"
+
+
+def _errors(values: FloatArray) -> str:
+    median = float(np.median(values)) * 1000
+    return f"{'—' if np.isinf(median) else f'{median:.1f}'} mm, {np.mean(values <= WITHIN_M):.0%}"
+
+
+COLUMNS = (
+    "model",
+    "frames, layout",
+    "scenes",
+    "single sample",
+    "Gaussian mean",
+    "Student's t",
+    "unparsable",
+    "tokens a plan, first / later",
+    "seconds, first / later",
+    "CPU seconds, first / later",
+)
+HEADER = "| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--models", nargs="+", default=["embedded"], help="as for rip.connect")
+    parser.add_argument("--frames", nargs="+", default=["world", "adaptive"])
+    parser.add_argument("--layouts", nargs="+", default=["sequence", "factorised"])
+    parser.add_argument("--nearest-last", action="store_true", help="also with the nearest demonstration last")
+    parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--sequence-scenes", type=int, default=3, help="sequences take a minute or more a plan")
+    parser.add_argument("--samples", type=int, default=5)
+    parser.add_argument("--temperature", type=float, default=0.5)
+    parser.add_argument("--deadline", type=float, default=300.0, help="seconds a plan")
+    parser.add_argument("--world", type=int, default=0, help="seed of the objects")
+    parser.add_argument("--out", type=Path, help="also write the table there")
+    args = parser.parse_args()
+    world = PickAndPlace(args.world)
+    lines = [reference_line(world, args.scenes)]
+    orders: list[Order] = ["given", "nearest-last"] if args.nearest_last else ["given"]
+    for name in args.models:
+        for layout in args.layouts:
+            for frames in args.frames:
+                for order in orders:
+                    row = Row(name, frames, layout, order)
+                    scenes = args.sequence_scenes if layout == "sequence" else args.scenes
+                    lines.append(as_line(row, measure(row, world, scenes, args)))
+                    print(lines[-1], flush=True)
+    table = (
+        f"{NUM_DEMOS} demonstrations, Q = {args.samples}, temperature {args.temperature:g}, objects {args.world}, "
+        f"{os.cpu_count()} cores with a load of {os.getloadavg()[2]:.1f} by the machine's other work.\n\n"
+        + HEADER
+        + "\n".join(lines)
+        + "\n"
+    )
+    print("\n" + table)
+    if args.out is not None:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_text(table)
+
+
+if __name__ == "__main__":
+    main()

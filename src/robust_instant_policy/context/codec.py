@@ -15,11 +15,11 @@ ROW_DIGITS = 4  # of a number of a whole trajectory: up to 10 m
 
 _MINUS = str.maketrans(dict.fromkeys("−–—‒﹣－", "-"))
 _BRACKETS = str.maketrans(dict.fromkeys("[](){}|", " "))
-_NUMBER = r"[+-]?\d{1,6}(?:\.\d{1,6})?"
+_NUMBER = r"[+-]?[0-9]{1,6}(?:\.[0-9]{1,6})?"
 _SPACED = re.compile(rf"{_NUMBER}(?:\s+{_NUMBER})*")
 _COMMAS = re.compile(rf"{_NUMBER}(?:\s*,\s*{_NUMBER})*")
-_LABEL = re.compile(r"^[^:=>]*[:=>]\s*(?=[-+\d\s])")
-_EDGES = " \t,;.`'\"*"
+_LABEL = re.compile(r"^[^:=>]*[:=>]\s*(?=[-+0-9])")
+_EDGES = " \t\r\n,;.`'\"*"
 
 
 def millimetres(metres: ArrayLike) -> np.ndarray:
@@ -76,22 +76,29 @@ def read_rows(text: str, columns: int) -> FloatArray | None:
     """The rows ``(N, columns)`` of numbers in an answer, or None when one of them cannot be read for certain.
 
     Around the rows there may be prose and code fences; the last row may be cut off, and is then left out. A line
-    between two rows that holds numbers but is not a row makes the answer worthless: a step would be missing.
+    before or between rows that looks like a row but is none makes the answer worthless: a step would be missing.
     """
     rows: list[FloatArray] = []
     broken = False
     for line in _lines(text):
         row = read_row(line, columns)
-        if row is not None:
-            if broken:
-                return None
+        if row is None:
+            broken = broken or _may_be_a_row(line, columns, follows_one=bool(rows))
+        elif broken:
+            return None
+        else:
             rows.append(row)
-        elif rows and re.search(r"\d", line):
-            broken = True
     return np.stack(rows) if rows else None
+
+
+def _may_be_a_row(line: str, columns: int, follows_one: bool) -> bool:
+    numbers = len(re.findall(r"\d+", line))
+    if follows_one or not re.search(r"[^\W\d_]", line):
+        return numbers > 0
+    return numbers >= max(2, columns // 2)  # "the 30 steps are:" may stand before the rows
 
 
 def _lines(text: str) -> list[str]:
     # A list of lists on one line: each inner list is a row.
-    flat = re.sub(r"\]\s*,?\s*\[", "]\n[", text) if re.search(r"\]\s*,?\s*\[[^\[\]]*[\d\s]+\]", text) else text
+    flat = re.sub(r"\]\s*,?\s*\[", "]\n[", text) if re.search(r"\]\s*,?\s*\[[^\[\]]*[0-9\s]+\]", text) else text
     return [line for line in re.split(r"[\n;]", flat) if line.strip()]

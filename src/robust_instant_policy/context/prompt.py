@@ -86,6 +86,8 @@ class InContextPrompt:
         keypoints = np.asarray(keypoints, dtype=np.float64)
         if keypoints.ndim != 3 or keypoints.shape[2] != 3 or not len(keypoints):
             raise InvalidValueError(f"keypoints must be (I, K, 3), got {keypoints.shape}")
+        if not np.isfinite(keypoints).all():
+            raise InvalidValueError(f"keypoints {keypoints.shape} hold values that are not finite")
         if len(trajectories) != len(keypoints):
             raise InvalidValueError(f"{len(keypoints)} sets of keypoints for {len(trajectories)} trajectories")
         widths = {trajectory.actions.shape[1] for trajectory in trajectories}
@@ -173,6 +175,13 @@ class InContextPrompt:
             for (step, dim), offset in zip(question.asked, offsets, strict=True):
                 rows[step, dim] += offset
         return Trajectory.from_actions(self._decode(keypoints, rows))
+
+    def median_trajectory(self, keypoints: FloatArray) -> Trajectory:
+        """What the frames alone say, without a model: in each step's frame the demonstrations' median.
+
+        A reference to measure models against. Only for ``layout="factorised"``.
+        """
+        return Trajectory.from_actions(self._decode(self._checked(keypoints), self._centre))
 
     def _read(self, query_index: int, text: str) -> FloatArray | None:
         if self.layout == "factorised":

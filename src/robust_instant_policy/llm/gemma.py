@@ -66,8 +66,9 @@ def _make(path: Path, digest: Path) -> None:
         ) from None
     finally:
         whole.unlink(missing_ok=True)
+    if not digest.exists():
+        print(LICENCE_NOTICE, file=sys.stderr)
     digest.write_text(_sha256(path) + "\n")
-    print(LICENCE_NOTICE, file=sys.stderr)
 
 
 def _is_kept(piece: bytes, kind: int) -> bool:

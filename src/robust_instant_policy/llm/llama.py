@@ -36,6 +36,7 @@ SLOT_STEP_TOKENS = 256  # slots come in multiples of this size
 SHORT_SLOTS = 32  # over all cores; a plan has about thirty steps
 MAX_SERVERS = 8  # cores beyond this bring little to about thirty prompts
 LONG_SLOTS = 5
+PROGRESS_TOKENS = 512  # read between two looks at the deadline
 MAX_CONTEXT_TOKENS = 32_768  # bounds memory for models with a longer context
 
 
@@ -217,8 +218,9 @@ class LlamaModel:
         # Layers with a sliding window forget what they read; a slot that is to go on from a prompt must not.
         params.swa_full = not layout.is_long
         params.cache_ram_mib = 0
-        threads = (os.cpu_count() or 1) if layout.is_long else 1
+        threads = _free_cores() if layout.is_long else 1
         params.cpuparams.n_threads = params.cpuparams_batch.n_threads = threads
+        params.n_batch = PROGRESS_TOKENS
         params.fit_params = False
         params.warmup = False
         params.verbosity = 0
@@ -233,6 +235,7 @@ def _request(query: Query, temperature: float, seed: int) -> dict[str, Any]:
         "seed": seed,
         "cache_prompt": True,
         "stream": True,
+        "return_progress": True,  # so that the deadline is looked at while a long prompt is read, too
         "stream_options": {"include_usage": True},
     }
     if query.grammar is not None:
@@ -276,6 +279,13 @@ def _complete(server: Any, request: dict[str, Any], count: int, deadline: float)
         )
         for index, parts in enumerate(pieces)
     ]
+
+
+def _free_cores() -> int:
+    # llama.cpp's threads spin while they wait for each other: with more of them than free cores all are slowed down
+    # many times over.
+    cores = os.cpu_count() or 1
+    return max(1, cores - round(os.getloadavg()[0])) if hasattr(os, "getloadavg") else cores
 
 
 def _short_layout(tokens: int) -> _Layout:

