@@ -129,3 +129,14 @@ def checked_dof(dof: float) -> float:
     if not value > 0:
         raise InvalidValueError(f"dof must be positive (inf is Gaussian), got {value} (a scalar, shape ())")
     return value
+
+
+def group_matrix(groups: ArrayLike | None, dimension: int) -> FloatArray:
+    """Averages ``(D, D)`` over the dimensions that share a label of ``groups (D,)``; each by itself if None."""
+    if groups is None:
+        return np.eye(dimension)
+    labels = np.asarray(groups)
+    if labels.shape != (dimension,):
+        raise InvalidValueError(f"groups must be ({dimension},), one label a dimension, got {labels.shape}")
+    same = labels[:, None] == labels
+    return same / same.sum(axis=1)

@@ -17,11 +17,12 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import squareform
 
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.regression.alignment import Candidates, checked_dof
-from robust_instant_policy.regression.student_t import DEFAULT_DOF, SCALE_FLOOR, StudentTRegression
+from robust_instant_policy.regression.alignment import Candidates, checked_dof, group_matrix
+from robust_instant_policy.regression.student_t import DEFAULT_DOF, ROUNDING, SCALE_FLOOR, StudentTRegression
 
 SAME_MODE = 2.3  # mean squared distance, in that of nearest neighbours, up to which candidates go the same way
 WORST_STEP = 25.0  # that one step may add to it at most: a wrong digit does not make a way of its own
+SAME_WAY_SHARE = 0.2  # of the pairs, at least, that go the same way: their distance is noise
 POOLED_SHARE = 0.5  # of all steps' noise in the noise that a step's distances are measured in
 MAX_SWEEPS = 10  # of fitting the modes and assigning the candidates to them
 
@@ -44,7 +45,7 @@ class StudentTMixture:
     def fit(self, candidates: Sequence[ArrayLike], times: Sequence[ArrayLike] | None = None) -> StudentTMixture:
         """Fit to ``candidates``, each ``(T_q, D)``, at ``times``, each ``(T_q,)`` in [0, 1] (evenly spread if None)."""
         data = Candidates.from_arrays(candidates, times)
-        labels = _partition(data.at(data.grid()))
+        labels = _partition(data.at(data.grid()), group_matrix(self.groups, data.num_dimensions))
         for _ in range(MAX_SWEEPS):
             self.modes = [self._fit_mode(data, labels == mode) for mode in range(labels.max() + 1)]
             assigned = np.where(labels < 0, -1, self._nearest_mode(data))
@@ -96,17 +97,19 @@ class StudentTMixture:
         return np.argmin(unlikely, axis=0)
 
 
-def _partition(blocks: FloatArray) -> np.ndarray:
+def _partition(blocks: FloatArray, groups: FloatArray) -> np.ndarray:
     """First labels ``(Q,)`` of candidates on common times ``(Q, K, D)``; 0 is the largest group, -1 is alone."""
     count = len(blocks)
     if count < 3:
         return np.zeros(count, dtype=np.intp)
     median = np.median(blocks, axis=0)
-    unit = np.ptp(median, axis=0)
-    unit = np.where(unit > 0, unit, 1.0)
-    gaps = (((blocks[:, None] - blocks[None]) / unit) ** 2).mean(axis=-1)
+    squares = (blocks[:, None] - blocks[None]) ** 2
+    pairs = squares[np.triu_indices(count, 1)]
+    least = (SCALE_FLOOR * np.ptp(median, axis=0) + ROUNDING * np.abs(median).max(axis=0)) ** 2 + 1e-200
+    unit = np.sqrt(groups @ (np.quantile(pairs, SAME_WAY_SHARE, axis=0).mean(axis=0) + least))
+    gaps = (squares / unit**2).mean(axis=-1)
     neighbour = (gaps.mean(axis=-1) + np.diag(np.full(count, np.inf))).argmin(axis=1)
-    noise = np.median(gaps[np.arange(count), neighbour], axis=0) + SCALE_FLOOR**2
+    noise = np.median(gaps[np.arange(count), neighbour], axis=0) + np.finfo(float).tiny
     if len(median) > 2:  # candidates sampled at other times cut a corner elsewhere, by up to a quarter of its bend
         noise[1:-1] += ((np.diff(median, 2, axis=0) / unit / 4) ** 2).mean(axis=-1)
     noise = (1 - POOLED_SHARE) * noise + POOLED_SHARE * noise.mean()

@@ -26,7 +26,7 @@ from scipy.special import gammaln, stdtrit
 
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.regression.alignment import Candidates, checked_dof
+from robust_instant_policy.regression.alignment import Candidates, checked_dof, group_matrix
 from robust_instant_policy.regression.basis import BANDS, FAINT, HatBasis, Roughness, solve_banded
 from robust_instant_policy.regression.diagnosis import error_freedom
 from robust_instant_policy.regression.smoothing import choose_stiffness
@@ -90,12 +90,12 @@ class StudentTRegression:
             raise UnknownNameError("unit", unit, UNITS)
         self.dof = checked_dof(dof)
         self.unit = unit
-        self.groups = None if groups is None else np.asarray(groups)
+        self.groups = groups
 
     def fit(self, candidates: Sequence[ArrayLike], times: Sequence[ArrayLike] | None = None) -> StudentTRegression:
         """Fit to ``candidates``, each ``(T_q, D)``, at ``times``, each ``(T_q,)`` in [0, 1] (evenly spread if None)."""
         data = Candidates.from_arrays(candidates, times)
-        groups = self._group_matrix(data.num_dimensions)
+        groups = group_matrix(self.groups, data.num_dimensions)
         if self.unit == "number":
             columns = np.arange(data.num_dimensions)[:, None]
             parts = [(replace(data, values=data.values[:, column]), column) for column in columns]
@@ -149,15 +149,6 @@ class StudentTRegression:
         if times.ndim != 1 or not np.isfinite(times).all():
             raise InvalidValueError(f"times must be (T,) and finite, got shape {times.shape}")
         return np.stack([np.interp(times, self.knots, column) for column in values.T], axis=1)
-
-    def _group_matrix(self, dimension: int) -> FloatArray:
-        """Averages over the dimensions of a group ``(D, D)``."""
-        if self.groups is None:
-            return np.eye(dimension)
-        if self.groups.shape != (dimension,):
-            raise InvalidValueError(f"groups must be ({dimension},), one label a dimension, got {self.groups.shape}")
-        same = self.groups[:, None] == self.groups
-        return same / same.sum(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
