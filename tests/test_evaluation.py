@@ -5,7 +5,9 @@ from robust_instant_policy.evaluation import Episode, EpisodeTable, success_tabl
 
 
 def episode(method: str, seed: int, success: bool, candidate: int = 0, task: str = "push-cube") -> Episode:
-    return Episode(task, method, 10, seed, candidate, success, 1.5, 5.0, 1000, None, "" if success else "missed")
+    return Episode(
+        task, "seen", method, 10, seed, candidate, success, 1.5, 5.0, 1000, None, "" if success else "missed"
+    )
 
 
 def test_the_wilson_interval_agrees_with_the_published_example():
@@ -26,7 +28,7 @@ def test_rows_survive_on_disk_and_go_on(tmp_path):
     again = EpisodeTable(tmp_path / "out" / "episodes.parquet")
     assert again.rows == table.rows
     again.add([episode("rip", 1, True)])
-    assert EpisodeTable(again.path).scenes == {("push-cube", "kat", 10, 1), ("push-cube", "rip", 10, 1)}
+    assert EpisodeTable(again.path).scenes == {("push-cube", "seen", "kat", 10, 1), ("push-cube", "seen", "rip", 10, 1)}
     assert [path.name for path in again.path.parent.iterdir()] == ["episodes.parquet"]
 
 

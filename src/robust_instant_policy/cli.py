@@ -99,6 +99,9 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--queries", type=_positive, default=5, metavar="Q")
     evaluate.add_argument("--seed", type=_natural, default=0)
     evaluate.add_argument("--llm", default="embedded")
+    evaluate.add_argument(
+        "--objects", choices=("seen", "unseen"), default="seen", help="test with objects like those shown, or others"
+    )
     evaluate.add_argument("--replay", action="store_true", help="answer from the stored samples only, without a model")
     evaluate.add_argument("--out", type=Path, required=True, metavar="DIR")
     _method_options(evaluate)
@@ -109,6 +112,16 @@ def _parser() -> argparse.ArgumentParser:
     view = command("view", _view, "a page that shows every demonstration of a folder")
     view.add_argument("--demos", type=Path, required=True, metavar="DIR")
     view.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR.html)")
+
+    keypoints = command("keypoints", _keypoints, "a page with the keypoints of demonstrations and new scenes, measured")
+    keypoints.add_argument("--demos", type=Path, required=True, metavar="DIR")
+    keypoints.add_argument(
+        "--scenes", type=_positive, default=20, metavar="N", help="new scenes (default: %(default)s)"
+    )
+    keypoints.add_argument("--seed", type=_natural, default=0)
+    keypoints.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
+    keypoints.add_argument("--noise", action="store_true", help="with the noise of a stereo depth camera")
+    keypoints.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR-keypoints.html)")
 
     samples = command("samples", _samples, "what a file of stored answers holds; export it")
     samples.add_argument("file", type=Path, metavar="FILE", help="samples.sqlite of an evaluation")
@@ -221,6 +234,7 @@ def _eval(options: argparse.Namespace) -> int:
         num_episodes=options.episodes,
         seed=options.seed,
         num_queries=options.queries,
+        objects=options.objects,
     )
     evaluate(experiment, options.llm, options.replay, options.out, DEFAULT_DATA, _method_settings(options))
     return 0
@@ -237,6 +251,14 @@ def _view(options: argparse.Namespace) -> int:
     from robust_instant_policy.datasets.page import write_page
 
     print(write_page(options.demos, options.out or options.demos.with_name(options.demos.name + ".html")))
+    return 0
+
+
+def _keypoints(options: argparse.Namespace) -> int:
+    from robust_instant_policy.keypoints import show_keypoints
+
+    out = options.out or options.demos.with_name(options.demos.name + "-keypoints.html")
+    show_keypoints(options.demos, options.features, options.scenes, options.noise, options.seed, out)
     return 0
 
 

@@ -19,17 +19,21 @@ _TYPES = {
     "float | None": pa.float64(),
 }
 
+Scene = tuple[str, str, str, int, int]  # task, objects, method, number of demonstrations, seed
+
 
 @dataclass(frozen=True)
 class Episode:
     """One execution of one trajectory.
 
-    ``candidate`` numbers the executions of one plan (0 where there is one); ``seconds`` is the wall time of
-    planning; ``executed_seconds`` the time the robot moved; ``failure`` says in words what went wrong and is
-    empty on success; ``tokens`` counts those given and written; ``confidence`` is the plan's.
+    ``objects`` are "seen" in the demonstrations or "unseen"; ``candidate`` numbers the executions of one plan
+    (0 where there is one); ``seconds`` is the wall time of planning; ``executed_seconds`` the time the robot
+    moved; ``failure`` says in words what went wrong and is empty on success; ``tokens`` counts those given and
+    written; ``confidence`` is the plan's.
     """
 
     task: str
+    objects: str
     method: str
     demos: int
     seed: int
@@ -42,9 +46,9 @@ class Episode:
     failure: str
 
     @property
-    def scene(self) -> tuple[str, str, int, int]:
+    def scene(self) -> Scene:
         """What identifies the plan this execution belongs to."""
-        return self.task, self.method, self.demos, self.seed
+        return self.task, self.objects, self.method, self.demos, self.seed
 
 
 _SCHEMA = pa.schema([(field.name, _TYPES[str(field.type)]) for field in fields(Episode)])
@@ -64,7 +68,7 @@ class EpisodeTable:
             self.rows = [Episode(**row) for row in table.to_pylist()]
 
     @property
-    def scenes(self) -> set[tuple[str, str, int, int]]:
+    def scenes(self) -> set[Scene]:
         """The plans whose executions are all there."""
         return {row.scene for row in self.rows}
 

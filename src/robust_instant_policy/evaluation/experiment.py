@@ -54,6 +54,7 @@ class Experiment:
     num_episodes: int = 10
     seed: int = 0
     num_queries: int = 5
+    objects: str = "seen"
 
     @property
     def num_plans(self) -> int:
@@ -85,7 +86,7 @@ def run_experiment(
                 methods := [
                     method
                     for method in experiment.methods
-                    if (task_name, method, experiment.num_demonstrations, seed) not in scenes
+                    if (task_name, experiment.objects, method, experiment.num_demonstrations, seed) not in scenes
                 ]
             )
         }
@@ -102,11 +103,14 @@ def run_experiment(
                 partial(on_recording, task_name),
             )
             instant = make_instant(task).fit(demonstrations)
+            if experiment.objects != "seen":
+                task.close()
+                task = make_task(task_name, experiment.objects)
             for seed, methods in missing.items():
                 observation = task.reset(seed)
                 for method in methods:
                     policy = make_policy(method, instant, experiment.num_queries)
-                    rows = roll_out(task, policy, observation, seed, experiment.num_demonstrations)
+                    rows = roll_out(task, policy, observation, seed, experiment.num_demonstrations, experiment.objects)
                     table.add(rows)
                     (out / "table.md").write_text(success_table(table.rows))
                     done += 1

@@ -11,13 +11,15 @@ from robust_instant_policy.policies import Policy
 from robust_instant_policy.tasks.task import Task
 
 
-def roll_out(task: Task, policy: Policy, observation: Observation, seed: int, num_demonstrations: int) -> list[Episode]:
+def roll_out(
+    task: Task, policy: Policy, observation: Observation, seed: int, num_demonstrations: int, objects: str = "seen"
+) -> list[Episode]:
     """Plan from ``observation`` and execute what the policy wants executed, each from a fresh reset to ``seed``.
 
     Methods that share an instant policy share its samples if they are given the same observation object.
     A plan that cannot be made, or that the arm refuses, is a failed episode, not an error.
     """
-    about = {"task": task.name, "method": policy.name, "demos": num_demonstrations, "seed": seed}
+    about = {"task": task.name, "objects": objects, "method": policy.name, "demos": num_demonstrations, "seed": seed}
     start = time.perf_counter()
     try:
         plan = policy.plan(observation)

@@ -14,10 +14,10 @@ def success_table(episodes: Sequence[Episode]) -> str:
     A cell gives the success rate, the 95% Wilson interval and the number of executions; the best rate of
     a task is bold.
     """
-    tasks = list(dict.fromkeys(row.task for row in episodes))
+    tasks = list(dict.fromkeys(_column(row) for row in episodes))
     methods = list(dict.fromkeys((row.method, row.demos) for row in episodes))
     rates = {
-        (method, task): _rate([row for row in episodes if (row.method, row.demos) == method and row.task == task])
+        (method, task): _rate([row for row in episodes if (row.method, row.demos) == method and _column(row) == task])
         for method in methods
         for task in tasks
     }
@@ -31,6 +31,10 @@ def success_table(episodes: Sequence[Episode]) -> str:
         cells = [_cell(*rates[method, task], best[task]) for task in tasks]
         lines.append(f"| {method[0]} | {method[1]} | {' | '.join(cells)} | {sum(known) / len(known):.0%} |")
     return "\n".join(lines) + "\n"
+
+
+def _column(row: Episode) -> str:
+    return row.task if row.objects == "seen" else f"{row.task} ({row.objects} objects)"
 
 
 def _rate(rows: Sequence[Episode]) -> tuple[float | None, int, int]:

@@ -1,0 +1,77 @@
+"""`rip keypoints`: a page with the keypoints of all demonstrations side by side, and how accurate they are."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from robust_instant_policy.console import StageConsole
+from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.evaluation import scene_seed
+from robust_instant_policy.perception import KeypointExtractor
+from robust_instant_policy.perception.accuracy import Accuracy, measure
+from robust_instant_policy.perception.page import keypoints_page
+from robust_instant_policy.tasks import TASK_NAMES, make_task
+from robust_instant_policy.tasks.camera_noise import CameraNoise
+
+Camera = Callable[[Observation], Observation]
+
+
+def show_keypoints(demos: Path, features: str, num_scenes: int, noisy: bool, seed: int, out: Path) -> Path:
+    """Write the page to ``out``. Where the demonstrations come from a simulated task, new scenes are drawn and
+    the keypoints in them are compared with the true places of the same material points; ``noisy`` puts the
+    depth camera's noise over all images first.
+    """
+    screen = StageConsole()
+    demonstrations = load_demonstrations(demos)
+    count = itertools.count()  # every photograph has noise of its own
+    camera: Camera = (lambda seen: CameraNoise().photograph(seen, next(count))) if noisy else (lambda seen: seen)
+    images = [camera(demonstration.observation) for demonstration in demonstrations]
+    name = demonstrations[0].task
+    simulated = name in TASK_NAMES and all(one.seed is not None for one in demonstrations)
+    extractor = KeypointExtractor(features=features)
+    scenes: list[Observation] = []
+    accuracy = None
+    if simulated:
+        task: Any = make_task(name)
+        try:
+            extractor = KeypointExtractor(features=features, workspace=task.workspace)
+            with screen.stage(f"keypoints of {len(images)} demonstrations"):
+                extractor.fit(images)
+            with screen.stage(f"{num_scenes} new scenes"):
+                scenes, accuracy = _compare(task, extractor, demonstrations, images, camera, num_scenes, seed)
+        finally:
+            task.close()
+        screen.say(f"    {accuracy.summary()}")
+    else:
+        with screen.stage(f"keypoints of {len(images)} demonstrations"):
+            extractor.fit(images)
+        screen.say("    the truth is known for simulated tasks only; nothing to compare with")
+    for note in extractor.notes_:
+        screen.say(f"    {note}")
+    out.write_text(keypoints_page(extractor, images, scenes, accuracy, f"Keypoints of {name}"), encoding="utf-8")
+    screen.say(f"page: {out}")
+    return out
+
+
+def _compare(
+    task: Any,
+    extractor: KeypointExtractor,
+    demonstrations: list[Demonstration],
+    images: list[Observation],
+    camera: Camera,
+    num_scenes: int,
+    seed: int,
+) -> tuple[list[Observation], Accuracy]:
+    known = []
+    for demonstration in demonstrations:
+        task.reset(demonstration.seed)
+        known.append(task.scene_truth())
+    scenes, scenes_known = [], []
+    for index in range(num_scenes):
+        scenes.append(camera(task.reset(scene_seed(seed, index))))
+        scenes_known.append(task.scene_truth())
+    return scenes, measure(extractor, images, known, scenes, scenes_known)
