@@ -355,7 +355,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few scenes, no networks, tables to the terminal only")
     quick = parser.parse_args().quick
-    scenes, clean, modes = (4, 8, 8) if quick else (SCENES, CLEAN_SCENES, MODE_SCENES)
+    scenes, clean, modes = (1, 2, 1) if quick else (SCENES, CLEAN_SCENES, MODE_SCENES)
     start = time.perf_counter()
     parts = {}
     if not quick:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -215,6 +216,13 @@ def test_other_bad_arguments_are_refused():
         fit.mean(np.zeros((2, 2)))
     with pytest.raises(RipError, match="level"):
         fit.interval(1.5)
+
+
+def test_the_benchmark_runs():
+    command = [sys.executable, str(Path(__file__).parents[1] / "benchmarks" / "regression.py"), "--quick"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    for title in ("Smooth truths", "Piecewise truths", "Diagnosis", "Intervals", "Several ways", "Single bad steps"):
+        assert title in printed
 
 
 def test_importing_the_regression_needs_no_torch():

@@ -68,3 +68,13 @@ def test_order_does_not_choose_between_equal_ways():
     mixture = fit(scene)
     backwards = StudentTMixture(groups=POINTS).fit([candidate[:, :9] for candidate in scene.candidates[::-1]])
     assert np.allclose(mixture.mean(), backwards.mean(), atol=1e-6)
+
+
+def test_ways_that_part_in_one_dimension_of_many_still_ones_are_found():
+    rng = np.random.default_rng(0)
+    truth = np.column_stack([np.linspace(0, 0.4, 30), np.zeros((30, 5)), np.full((30, 3), 0.1)])
+    side = np.outer(np.sin(np.linspace(0, np.pi, 30)), np.eye(9)[1]) * 0.1
+    candidates = [truth + sign * side + rng.normal(0, 0.003, truth.shape) for sign in (1, -1, 1, 1, -1)]
+    mixture = StudentTMixture().fit(candidates)
+    assert mixture.labels.tolist() == [0, 1, 0, 0, 1]
+    assert np.abs(mixture.mean() - truth - side).max() < 0.015

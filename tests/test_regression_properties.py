@@ -77,8 +77,8 @@ def test_rigid_motions_of_the_input_move_the_output_alike(seed, kind, estimator)
 
     one = robust_gripper_trajectory(scene.candidates, estimator=estimator)
     other = robust_gripper_trajectory([moved(candidate) for candidate in scene.candidates], estimator=estimator)
-    # the start is a median of coordinates, which turns with the axes only roughly; what it starts does not
-    assert np.allclose(other.actions, moved(one.actions), atol=1e-3)
+    # the start is a median of coordinates, which turns with the axes only roughly; where it leads to does not
+    assert np.allclose(other.actions, moved(one.actions), atol=1e-4)
     assert other.hallucinated.tolist() == one.hallucinated.tolist()
 
 
