@@ -8,7 +8,7 @@ the same share of the part's visible extent along each axis of its frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -76,13 +76,16 @@ def measure(
     known: Sequence[KnownScene],
     scenes: Sequence[Observation],
     scenes_known: Sequence[KnownScene],
+    camera: Callable[[Observation, int], Observation] | None = None,
 ) -> Accuracy:
     """Locate the keypoints of a fitted ``extractor`` in new ``scenes`` and compare with the truth.
 
-    ``demonstrations`` are the images it was fitted to, ``known`` their truth.
+    ``demonstrations`` are the images it was fitted to, ``known`` their truth, all as rendered; ``camera`` makes of a
+    scene and its number what the extractor gets to see.
     """
     parts = [_part_of(k, extractor.pixels_, known, scenes_known) for k in range(extractor.pixels_.shape[1])]
-    located = tuple(extractor.locate(scene) for scene in scenes)
+    seen = scenes if camera is None else [camera(scene, number) for number, scene in enumerate(scenes)]
+    located = tuple(extractor.locate(image) for image in seen)
     truth = np.full((len(scenes), len(parts), 3), np.nan)
     for k, part in enumerate(parts):
         if not part:

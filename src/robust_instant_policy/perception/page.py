@@ -21,7 +21,7 @@ IMAGE_PX = 300  # shown width of an image
 JPEG_QUALITY = 85
 STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:1300px;padding:0 1rem;color:#222}
-.row{display:flex;flex-wrap:wrap;gap:12px} figure{margin:0} figcaption{font-size:12px;color:#555}
+.row{display:flex;flex-wrap:wrap;gap:12px} figure{margin:0} figcaption{font-size:12px;color:#555;max-width:300px}
 svg{display:block;border-radius:4px} text{font:bold 11px system-ui;paint-order:stroke;stroke:#000;stroke-width:2.5px}
 table{border-collapse:collapse;font-size:13px} td,th{padding:2px 10px;border-bottom:1px solid #ddd;text-align:right}
 """

@@ -156,7 +156,7 @@ def closest_points(
             motions = upright_motions(source_points, target_points, weights + 1e-9)
         else:
             explained = (own * np.exp(-back_cost / NEAR_M**2)).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
-            fits = (np.exp(-forth_cost / NEAR_M**2).mean(axis=1) + explained) / 2
+            fits = np.sqrt(np.exp(-forth_cost / NEAR_M**2).mean(axis=1) * explained)
     return motions, fits
 
 
