@@ -1,0 +1,262 @@
+"""Vision-transformer descriptors against transformers' own models and against slow, plain formulas."""
+
+import json
+import math
+import time
+
+import numpy as np
+import pytest
+import torch
+import transformers
+from safetensors.torch import load_file, save_file
+
+from robust_instant_policy.errors import InvalidValueError, ModelError
+from robust_instant_policy.perception import PAPER_REAL, PAPER_SIMULATION, DescriptorSettings, KeypointExtractor
+from robust_instant_policy.perception.descriptors import DescriptorMap
+from robust_instant_policy.perception.vit import VisionTransformer, VitDescriptors
+from robust_instant_policy.perception.vit_checkpoint import load_checkpoint
+from tests.test_perception import scenes
+
+FAMILY = {
+    "vit": (
+        transformers.ViTModel,
+        transformers.ViTConfig,
+        {"patch_size": 8, "image_size": 64, "num_attention_heads": 6, "intermediate_size": 96},
+    ),
+    "dinov2": (transformers.Dinov2Model, transformers.Dinov2Config, {"patch_size": 14, "image_size": 112}),
+    "dinov2-swiglu": (
+        transformers.Dinov2Model,
+        transformers.Dinov2Config,
+        {"patch_size": 14, "image_size": 112, "use_swiglu_ffn": True},
+    ),
+    "dinov2-registers": (
+        transformers.Dinov2WithRegistersModel,
+        transformers.Dinov2WithRegistersConfig,
+        {"patch_size": 14, "image_size": 112, "layerscale_value": 0.7},
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=FAMILY)
+def saved(request, tmp_path_factory):
+    """A randomly initialised model of each family, and the folder it was saved to."""
+    model_class, config_class, options = FAMILY[request.param]
+    torch.manual_seed(0)
+    config = config_class(
+        hidden_size=48,
+        num_hidden_layers=3,
+        attn_implementation="eager",
+        **{"num_attention_heads": 3, **options},
+    )
+    model = model_class(config).eval()
+    with torch.no_grad():  # the usual start is so small that all patches look alike
+        for parameter in model.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    folder = tmp_path_factory.mktemp(request.param)
+    model.save_pretrained(folder)
+    return model, folder
+
+
+@pytest.fixture(scope="module")
+def vit_folder(tmp_path_factory):
+    torch.manual_seed(1)
+    config = transformers.ViTConfig(
+        hidden_size=48, num_hidden_layers=11, num_attention_heads=6, intermediate_size=64, patch_size=8, image_size=64
+    )
+    folder = tmp_path_factory.mktemp("vit")
+    transformers.ViTModel(config).save_pretrained(folder)
+    return folder
+
+
+def test_tokens_and_saliency_are_those_of_transformers_own_model(saved):
+    model, folder = saved
+    checkpoint = load_checkpoint(str(folder))
+    ours = VisionTransformer(checkpoint, checkpoint.config.patch_size)
+    side = model.config.image_size
+    batch = torch.randn(1, 3, side, side)
+    special = 1 + checkpoint.config.num_register_tokens
+    with torch.inference_mode():
+        theirs = model(batch, output_hidden_states=True, output_attentions=True)
+    for layer in range(3):
+        expected = theirs.hidden_states[layer + 1][0, special:]
+        found = ours.features(batch, layer, "token").descriptors.reshape(expected.shape)
+        torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+    heads = [0, 2, 4, 5] if checkpoint.config.num_attention_heads == 6 else [0, 1, 2]
+    attention = theirs.attentions[-1][0, heads, 0, special:].mean(dim=0)
+    attention = (attention - attention.min()) / (attention.max() - attention.min())
+    torch.testing.assert_close(ours.features(batch, 1, "key").saliency.flatten(), attention, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("facet", ["query", "key", "value"])
+@pytest.mark.parametrize("layer", [0, 2])
+def test_facets_are_projections_of_the_normalised_tokens(vit_folder, facet, layer):
+    weights = load_file(vit_folder / "model.safetensors")
+    ours = VisionTransformer(load_checkpoint(str(vit_folder)), 8)
+    batch = torch.randn(1, 3, 64, 64)
+    tokens = (
+        ours.features(batch, layer - 1, "token").descriptors.reshape(64, -1) if layer else ours._embed(batch)[0][0, 1:]
+    )
+    block = f"encoder.layer.{layer}"
+    normed = torch.nn.functional.layer_norm(
+        tokens, (48,), weights[f"{block}.layernorm_before.weight"], weights[f"{block}.layernorm_before.bias"], 1e-12
+    )
+    name = f"{block}.attention.attention.{facet}"
+    expected = normed @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
+    expected = expected.reshape(64, 6, 8).transpose(1, 2).reshape(64, 48)  # the reference keeps heads innermost
+    found = ours.features(batch, layer, facet).descriptors.reshape(64, 48)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+
+
+def test_overlapping_patches_get_position_encodings_between_the_trained_ones(vit_folder):
+    ours = VisionTransformer(load_checkpoint(str(vit_folder)), 2)
+    table = load_file(vit_folder / "model.safetensors")["embeddings.position_embeddings"]
+    rows, cols = 21, 29
+    dense = ours._positions(rows, cols)[0, 1:].reshape(rows, cols, 48)
+    # Bicubic interpolation by DINO's own scale, (n + 0.1) / 8, written out for one place.
+    square = table[0, 1:].reshape(8, 8, 48).double().numpy()
+
+    def kernel(x: float) -> float:
+        x = abs(x)
+        if x <= 1:
+            return 1.25 * x**3 - 2.25 * x**2 + 1
+        return -0.75 * (x**3 - 5 * x**2 + 8 * x - 4) if x < 2 else 0.0
+
+    y, x = (13 + 0.5) * 8 / (rows + 0.1) - 0.5, (6 + 0.5) * 8 / (cols + 0.1) - 0.5
+    expected = np.zeros(48)
+    for i in range(math.floor(y) - 1, math.floor(y) + 3):
+        for j in range(math.floor(x) - 1, math.floor(x) + 3):
+            expected += kernel(y - i) * kernel(x - j) * square[np.clip(i, 0, 7), np.clip(j, 0, 7)]
+    np.testing.assert_allclose(dense[13, 6].numpy(), expected, atol=1e-5)
+
+
+def slow_log_bins(features: np.ndarray) -> np.ndarray:
+    """Log-binned descriptors ``(rows, cols, 17 D)``, patch by patch (Amir et al. 2022, Sec. 3)."""
+    rows, cols, _ = features.shape
+    pooled = np.zeros_like(features)
+    for r in range(rows):
+        for c in range(cols):
+            pooled[r, c] = features[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2].mean(axis=(0, 1))
+    result = []
+    for r in range(rows):
+        for c in range(cols):
+            parts = []
+            for level, reach in ((features, 1), (pooled, 3)):
+                for i in (r - reach, r, r + reach):
+                    for j in (c - reach, c, c + reach):
+                        if reach == 1 or (i, j) != (r, c):
+                            parts.append(level[min(max(i, 0), rows - 1), min(max(j, 0), cols - 1)])
+            result.append(np.concatenate(parts))
+    return np.array(result)
+
+
+def random_map(seed: int, rows: int, cols: int) -> DescriptorMap:
+    rng = np.random.default_rng(seed)
+    features = rng.normal(size=(rows, cols, 12)).astype(np.float32)
+    return DescriptorMap(features, np.ones((rows, cols), np.float32), np.zeros(2), np.ones(2), log_bins=True)
+
+
+def test_log_bins_equal_the_plain_formula():
+    described = random_map(0, 9, 7)
+    found = described.vectors(np.arange(63))
+    np.testing.assert_allclose(found, slow_log_bins(described.features), atol=1e-5)
+    assert described.vectors(np.arange(3)).shape == (3, 17 * 12)
+
+
+def test_similarities_equal_the_cosine_of_the_written_out_descriptors():
+    one, two = random_map(1, 8, 6), random_map(2, 5, 11)
+    mine, its = np.array([0, 7, 30, 47]), np.arange(0, 55, 3)
+    a, b = slow_log_bins(one.features)[mine], slow_log_bins(two.features)[its]
+    expected = (a @ b.T) / np.linalg.norm(a, axis=1)[:, None] / np.linalg.norm(b, axis=1)
+    np.testing.assert_allclose(one.similarities(mine, two, its), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "shape", "grid"), [(PAPER_SIMULATION, (100, 100), (47, 47)), (PAPER_REAL, (240, 320), (59, 79))]
+)
+def test_the_papers_settings_give_the_papers_grids(vit_folder, settings, shape, grid):
+    described = VitDescriptors(load_checkpoint(str(vit_folder)), settings).describe(
+        np.random.default_rng(0).integers(0, 255, (*shape, 3), dtype=np.uint8)
+    )
+    assert described.grid == grid
+    np.testing.assert_allclose(described.pixels[0], (3.5, 3.5))
+    np.testing.assert_allclose(described.pixels[-1], np.array(shape[::-1]) - 4.5, atol=settings.stride)
+    assert described.saliency.min() == 0
+    assert described.saliency.max() == 1
+
+
+def test_keypoints_come_from_a_folder_of_weights(vit_folder):
+    settings = DescriptorSettings(load_size=100, stride=4)
+    demonstrations = [scene.observation for scene in scenes(3, seed=0, turn=10)]
+    extractor = KeypointExtractor(features=str(vit_folder), settings=settings).fit(demonstrations)
+    assert extractor.descriptor_name_ == str(vit_folder)
+    assert extractor.keypoints_.shape == (3, 10, 3)
+    assert extractor.locate(demonstrations[0]).keypoints.shape == (10, 3)
+
+
+def test_auto_takes_weights_that_are_named_in_the_environment(vit_folder, monkeypatch):
+    monkeypatch.setenv("RIP_DINO_WEIGHTS", str(vit_folder))
+    extractor = KeypointExtractor(settings=DescriptorSettings(load_size=100, stride=8))
+    extractor.fit([scenes(1, seed=0)[0].observation])
+    assert extractor.descriptor_name_ == str(vit_folder)
+    assert "RIP_DINO_WEIGHTS" in extractor.notes_[0]
+
+
+def test_a_lone_safetensors_file_is_enough(vit_folder):
+    folder, file = load_checkpoint(str(vit_folder)), load_checkpoint(str(vit_folder / "model.safetensors"))
+    assert file.config.num_hidden_layers == folder.config.num_hidden_layers
+    assert file.config.patch_size == 8
+    assert file.config.num_positions == 65
+
+
+def test_a_checkpoint_that_does_not_fit_says_which_tensors(vit_folder, tmp_path):
+    tensors = load_file(vit_folder / "model.safetensors")
+    del tensors["encoder.layer.3.output.dense.bias"]
+    tensors["encoder.layer.1.layernorm_before.weight"] = torch.ones(7)
+    save_file(tensors, tmp_path / "model.safetensors")
+    (tmp_path / "config.json").write_text((vit_folder / "config.json").read_text())
+    with pytest.raises(ModelError) as error:
+        load_checkpoint(str(tmp_path))
+    assert "encoder.layer.3.output.dense.bias is missing" in str(error.value)
+    assert "encoder.layer.1.layernorm_before.weight is (7,) instead of (48,)" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_model_of_another_kind_is_refused_by_name(vit_folder, tmp_path):
+    (tmp_path / "model.safetensors").write_bytes((vit_folder / "model.safetensors").read_bytes())
+    config = json.loads((vit_folder / "config.json").read_text()) | {"model_type": "swin"}
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ModelError, match="'swin' model; supported: vit, dinov2, dinov2_with_registers"):
+        load_checkpoint(str(tmp_path))
+
+
+@pytest.mark.parametrize("source", ["/no/such/folder", "weights.safetensors", "a/b/c"])
+def test_a_source_that_is_nowhere_is_told(source):
+    with pytest.raises(ModelError, match="no folder or file"):
+        load_checkpoint(source)
+
+
+def test_a_broken_file_is_told_in_one_line(tmp_path):
+    (tmp_path / "model.safetensors").write_bytes(b"not weights at all")
+    with pytest.raises(ModelError, match="cannot be read as weights") as error:
+        load_checkpoint(str(tmp_path))
+    assert "\n" not in str(error.value)
+
+
+def test_without_a_connection_the_hub_is_given_up_within_seconds(monkeypatch, tmp_path):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    start = time.monotonic()
+    with pytest.raises(ModelError, match=r"facebook/dino-vits8 are not in the local cache and the hub cannot") as error:
+        load_checkpoint("facebook/dino-vits8")
+    assert time.monotonic() - start < 8
+    assert "\n" not in str(error.value)
+
+
+def test_strides_layers_and_facets_that_do_not_exist_are_refused(vit_folder):
+    checkpoint = load_checkpoint(str(vit_folder))
+    with pytest.raises(InvalidValueError, match="stride 3 must divide the patch size 8"):
+        VisionTransformer(checkpoint, 3)
+    with pytest.raises(InvalidValueError, match="layer must be 0 to 10"):
+        VisionTransformer(checkpoint, 8).features(torch.zeros(1, 3, 64, 64), 11, "key")
+    with pytest.raises(InvalidValueError, match="facet must be one of key, query, value, token"):
+        VisionTransformer(checkpoint, 8).features(torch.zeros(1, 3, 64, 64), 1, "keys")
