@@ -25,6 +25,7 @@ from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 MM = 1000.0
 SHOWN_DEMONSTRATIONS = 10
+MOSTLY = 0.5  # mean weight below which a hallucinated candidate was ignored more than followed
 AXIS_STEPS = 6  # gripper axes drawn along the robust trajectory
 AXIS_LENGTH_M = 0.03
 WEIGHT_COLOURS = "Viridis"
@@ -402,10 +403,11 @@ def _verdicts(plan: Plan) -> str:
     for index, candidate in enumerate(plan.candidates):
         bad = bool(plan.hallucinated[index])
         start = int(plan.onset[index])
+        verdict = "hallucinated" if plan.weights[index].mean() < MOSTLY else "hallucinated in part"
         rows.append(
             (
                 str(index + 1),
-                "hallucinated" if bad else "agrees",
+                verdict if bad else "agrees",
                 f"step {start} of {len(plan.trajectory)} (time {plan.trajectory.times[start]:.2f})"
                 if bad and start >= 0
                 else "–",
@@ -497,6 +499,8 @@ closed. The black line is the robust mean, the grey band its scale; dotted red l
 proposals.</p>
 <div class="panel">{dimensions}</div>
 <h2>Which proposals were hallucinated</h2>
+<p>A proposal that leaves the agreement is ignored from there on for as long as it stays away; what it says elsewhere
+still counts. The score adds up how far a proposal strays from the robust mean, in scales of what the others show.</p>
 {verdicts}
 <h2>Where the time went</h2>
 {stages}
