@@ -111,6 +111,11 @@ def effective_count(weights: FloatArray) -> FloatArray:
     return weights.sum(axis=0) ** 2 / np.maximum((weights**2).sum(axis=0), np.finfo(float).tiny)
 
 
+def small_sample_factor(deciding: FloatArray) -> FloatArray:
+    """n / (n - 1): what squared residuals about a mean of n = ``deciding (T,)`` candidates lack of squared errors."""
+    return deciding / np.maximum(deciding - 1, MIN_FREEDOM)
+
+
 def error_freedom(deciding: FloatArray) -> FloatArray:
     """Degrees of freedom of an error that was estimated from ``deciding (T,)`` candidates."""
     return FREEDOM_PER_CANDIDATE * np.maximum(deciding - 1, MIN_FREEDOM)

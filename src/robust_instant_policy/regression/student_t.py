@@ -28,7 +28,7 @@ from robust_instant_policy.errors import InvalidValueError, UnknownNameError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression.alignment import Candidates, checked_dof, group_matrix
 from robust_instant_policy.regression.basis import BANDS, FAINT, HatBasis, Roughness, solve_banded
-from robust_instant_policy.regression.diagnosis import error_freedom
+from robust_instant_policy.regression.diagnosis import effective_count, error_freedom, small_sample_factor
 from robust_instant_policy.regression.smoothing import choose_stiffness
 from robust_instant_policy.regression.switching import persistent
 from robust_instant_policy.regression.uncertainty import squared_error
@@ -118,9 +118,16 @@ class StudentTRegression:
         return self._evaluate(np.hstack([part.state.curve for part in self._parts]), times)
 
     def scale(self, times: ArrayLike | None = None) -> FloatArray:
-        """The scale σ ``(T, D)`` of trustworthy candidates about the mean at ``times (T,)``."""
-        squared = np.hstack([part.state.profile[:, None] * part.state.squared_scale for part in self._parts])
-        return self._evaluate(np.sqrt(squared), times)
+        """The scale σ ``(T, D)`` of trustworthy candidates about the truth at ``times (T,)``.
+
+        The likelihood's σ is that about the fitted mean, which n candidates draw to themselves by n / (n - 1).
+        """
+        squared = [
+            (part.state.profile * small_sample_factor(part.model.deciding(part.state)))[:, None]
+            * part.state.squared_scale
+            for part in self._parts
+        ]
+        return self._evaluate(np.sqrt(np.hstack(squared)), times)
 
     def standard_error(self, times: ArrayLike | None = None) -> FloatArray:
         """How far ``(T, D)`` the mean may be off at ``times (T,)``; infinite for a single candidate."""
@@ -283,6 +290,11 @@ class PenalisedLikelihood:
         precision = self.weights(state) / self.basis.spread(state.profile)
         residuals = self.basis.residuals(self.data.values, state.curve)
         return self.basis.normal_matrix(precision), self.basis.project_each(precision, residuals)
+
+    def deciding(self, state: State) -> FloatArray:
+        """How many candidates decide the curve at each knot ``(K,)``."""
+        weights = self.weights(state)
+        return effective_count(self.basis.project_each(weights, np.ones((len(weights), 1)))[:, :, 0].T)
 
     def acceleration(self, state: State) -> FloatArray:
         """Mean squared acceleration ``(K-2,)``, in scales."""

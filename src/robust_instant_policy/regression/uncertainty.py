@@ -8,7 +8,7 @@ import numpy as np
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression.basis import FAINT, solve_banded
-from robust_instant_policy.regression.diagnosis import MIN_FREEDOM, effective_count
+from robust_instant_policy.regression.diagnosis import small_sample_factor
 
 if TYPE_CHECKING:
     from robust_instant_policy.regression.student_t import PenalisedLikelihood, State
@@ -30,9 +30,8 @@ def squared_error(model: PenalisedLikelihood, state: State) -> tuple[FloatArray,
     weights = model.weights(state)
     shared = len(state.squared_scale) * (model.data.lengths.mean() if model.unit == "trajectory" else 1)
     slope = 1 - 2 / shared * (weights @ (distance / (model.dof + distance))) / weights.sum()
-    by_candidate = model.basis.project_each(weights, np.ones((len(weights), 1)))[:, :, 0]
-    deciding = effective_count(by_candidate.T)
-    inflation = deciding / np.maximum(deciding - 1, MIN_FREEDOM) / max(slope, MIN_SLOPE) ** 2
+    deciding = model.deciding(state)
+    inflation = small_sample_factor(deciding) / max(slope, MIN_SLOPE) ** 2
 
     normal, pulls = model.pulls(state)
     flat = pulls.reshape(len(pulls), -1)
