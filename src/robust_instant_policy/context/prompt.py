@@ -30,7 +30,7 @@ AGREE_MM = 1.0  # a number on which all demonstrations agree this closely is not
 MIN_DEMOS_TO_AGREE = 3
 INPUTS_PER_QUERY = 2  # keypoint coordinates shown with each example
 NOISE_MM = 5.0  # variation of a coordinate that says nothing
-STEPS_PER_QUERY = 3  # neighbouring steps asked for together
+STEPS_PER_QUERY = 4  # neighbouring steps asked for together: they share the examples' inputs
 TOKENS_PER_NUMBER = 6  # upper bound for a number with its separator
 REACH_MM = 5000.0  # numbers beyond this are no place a robot can go
 
@@ -324,7 +324,9 @@ def _telling_inputs(shown: FloatArray, outputs: FloatArray) -> tuple[int, ...]:
 
 
 def _shown(inputs: FloatArray, chosen: Sequence[int]) -> str:
-    return write_row(np.round(inputs[list(chosen)])) + ": "
+    # A line of its own: after a space, models would have to write a minus otherwise than in the examples, where space
+    # and minus are one token.
+    return write_row(np.round(inputs[list(chosen)])) + "\n"
 
 
 def _sequence_input(keypoints: FloatArray) -> str:
