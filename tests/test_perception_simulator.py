@@ -5,7 +5,7 @@ import pytest
 pytest.importorskip("mani_skill")
 
 from robust_instant_policy.perception import KeypointExtractor, measure
-from robust_instant_policy.tasks import FIRST_TEST_SEED, make_task
+from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 
 
@@ -14,7 +14,7 @@ def test_keypoints_of_push_cube_are_found_within_millimetres(noisy):
     task = make_task("push-cube")
     try:
         images, truths = [], []
-        for seed in [*range(4), *range(FIRST_TEST_SEED, FIRST_TEST_SEED + 3)]:
+        for seed in [*range(4), *range(100_000, 100_003)]:
             images.append(task.reset(seed))
             truths.append(task.scene_truth())
     finally:
