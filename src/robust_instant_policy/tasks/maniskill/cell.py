@@ -63,7 +63,7 @@ class CellEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        pose = sapien_utils.look_at(eye=(-0.22, -0.95, 0.72), target=(-0.1, 0.04, 0.16))
+        pose = sapien_utils.look_at(eye=(-0.22, -0.95, 0.72), target=(-0.1, 0.04, 0.09))
         return CameraConfig("render_camera", pose, VIDEO_WIDTH, VIDEO_HEIGHT, fov=0.95, near=0.05, far=20.0)
 
     def _load_agent(self, options: dict) -> None:
@@ -146,4 +146,4 @@ class CellEnv(BaseEnv):
 
     def tool_pose(self) -> FloatArray:
         """Where the tool frame is, ``(4, 4)``."""
-        return self.agent.tcp.pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)
+        return self.agent.tcp._objs[0].pose.to_transformation_matrix().astype(np.float64)

@@ -16,7 +16,7 @@ from robust_instant_policy.tasks.maniskill.carpentry import add_box, add_cylinde
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill.object_sets import draw_object
-from robust_instant_policy.tasks.maniskill.paint import BLACK, BRASS, STEEL, WHITE, Paint
+from robust_instant_policy.tasks.maniskill.paint import BLACK, STEEL, WHITE, Paint
 from robust_instant_policy.tasks.maniskill.poses import downward, facing
 from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
 
@@ -88,7 +88,7 @@ class Cabinet:
             handle_kind="knob",
             body=bodies[number % 3],
             door=doors[(number // 3 + number) % 3],
-            handle=BRASS,
+            handle=STEEL,
             shelf=False,
         )
 
@@ -205,10 +205,10 @@ def shut(env: CloseCabinetEnv, rng: np.random.Generator) -> list[Stroke]:
 
     arc = [at(opened, 0.0, height) for opened in np.linspace(angle, 0.0, ARC_POINTS)]
     return [
-        Stroke(np.array([at(angle, APPROACH_M, height + ABOVE_M)]), closed=True, speed=0.35, error=0.005),
+        Stroke(np.array([at(angle, APPROACH_M, height + ABOVE_M)]), closed=True, free=True, speed=0.35, error=0.005),
         Stroke(np.array([at(angle, APPROACH_M, height)]), closed=True, speed=0.15, error=0.003),
         Stroke(np.array([*arc[:-1], at(0.0, -PRESS_M, height)]), closed=True, speed=0.15),
-        Stroke(np.array([at(0.0, 0.05, height + 0.03)]), closed=True, error=0.005),
+        Stroke(np.array([at(0.0, 0.05, height + 0.03)]), closed=True, free=True, error=0.005),
     ]
 
 

@@ -19,7 +19,9 @@ SPEED_SPREAD = 0.15  # of the log of an episode's and a stroke's speed
 MIN_STROKE_S = 0.35
 TURN_RADIUS_M = 0.12  # a turn of one radian takes as long as this many metres
 SKEW_SPREAD = 0.12  # of the log of the exponent that makes strokes start or end faster
-VIA_ERROR_M = 0.008
+BOW_SHARE = 0.06  # of its length: how far a free stroke bows out from the straight line
+BOW_UP_SHARE = 0.05  # and how far it arches on average, as a hand lifts to travel
+HESITATION_CHANCE, HESITATION_S = 0.15, (0.15, 0.45)
 AIM_ERROR_RAD = 0.02
 TREMOR_M = 0.0004
 TREMOR_HZ = (0.6, 3.5)
@@ -33,6 +35,7 @@ class Stroke:
 
     ``error`` is the spread, in metres, with which the person hits the last position; ``speed`` the usual mean
     speed in m/s; ``pause`` the usual rest afterwards in seconds; ``closed`` the gripper state from then on.
+    A ``free`` stroke touches nothing and may bow out on its way.
     """
 
     poses: FloatArray
@@ -40,6 +43,7 @@ class Stroke:
     speed: float = 0.25
     error: float = 0.002
     pause: float = 0.08
+    free: bool = False
 
 
 def perform(
@@ -52,6 +56,8 @@ def perform(
     for stroke in strokes:
         path = _move(here, stroke, pace, rng, rate_hz)
         rest = stroke.pause * rng.uniform(0.3, 1.7)
+        if rng.random() < HESITATION_CHANCE:
+            rest += rng.uniform(*HESITATION_S)
         poses.append(path)
         closed.append(np.full(len(path), shut))
         if stroke.closed != shut:
@@ -67,12 +73,9 @@ def perform(
 
 def _move(here: FloatArray, stroke: Stroke, pace: float, rng: np.random.Generator, rate_hz: float) -> FloatArray:
     knots = np.concatenate([here[None], stroke.poses])
-    spread = np.full(len(knots), VIA_ERROR_M)
-    spread[0], spread[-1] = 0.0, stroke.error
-    if len(knots) > 3:  # a drawn curve is followed, not cut: its points share one error
-        knots[1:, :3, 3] += rng.normal(0.0, stroke.error, 3)
-    else:
-        knots[:, :3, 3] += rng.normal(0.0, 1.0, (len(knots), 3)) * spread[:, None]
+    knots[1:, :3, 3] += rng.normal(0.0, stroke.error, 3)  # a drawn curve is missed as a whole, not point by point
+    if stroke.free:
+        knots = np.insert(knots, 1, _bow(knots[0], knots[1], rng), axis=0)
     turn = Rotation.from_rotvec(rng.normal(0.0, AIM_ERROR_RAD, 3)).as_matrix()
     knots[1:, :3, :3] = knots[1:, :3, :3] @ turn
     rotations = Rotation.from_matrix(knots[:, :3, :3])
@@ -87,6 +90,16 @@ def _move(here: FloatArray, stroke: Stroke, pace: float, rng: np.random.Generato
     path[:, :3, 3] = CubicSpline(along, knots[:, :3, 3], bc_type="natural")(at)
     path[:, :3, :3] = Slerp(along, rotations)(np.minimum(at, along[-1])).as_matrix()
     return path
+
+
+def _bow(start: FloatArray, stop: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """A pose ``(4, 4)`` half way, off the straight line."""
+    length = float(np.linalg.norm(stop[:3, 3] - start[:3, 3]))
+    middle = stop.copy()
+    middle[:3, 3] = (start[:3, 3] + stop[:3, 3]) / 2 + length * rng.normal(0.0, BOW_SHARE, 3)
+    middle[2, 3] += length * BOW_UP_SHARE
+    middle[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix([start[:3, :3], stop[:3, :3]]))(0.5).as_matrix()
+    return middle
 
 
 def _tremor(length: int, rng: np.random.Generator, rate_hz: float) -> FloatArray:

@@ -15,7 +15,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.maniskill.carpentry import add_box, add_cylinder, hinge
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.demonstrator import Stroke
-from robust_instant_policy.tasks.maniskill.paint import BLACK, BRASS, STEEL, WHITE, Paint
+from robust_instant_policy.tasks.maniskill.paint import BLACK, STEEL, WHITE, Paint
 from robust_instant_policy.tasks.maniskill.poses import downward, facing
 from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
 
@@ -44,7 +44,7 @@ BODIES = (
     WHITE,
 )
 FRONTS = (WHITE, Paint((0.88, 0.80, 0.62), grain=True), Paint((0.30, 0.38, 0.47)), Paint((0.62, 0.30, 0.22)))
-HANDLES = (BLACK, BRASS, STEEL)
+HANDLES = (BLACK, WHITE, STEEL)
 HANDLE_KINDS = ("knob", "fin", "bar")
 
 
@@ -184,7 +184,7 @@ def pull(env: OpenDrawerEnv, rng: np.random.Generator) -> list[Stroke]:
         return env.front_pose @ downward(-out, 0.0, z)
 
     return [
-        Stroke(np.array([at(reach, height + ABOVE_M)]), closed=False, speed=0.35, error=0.005),
+        Stroke(np.array([at(reach, height + ABOVE_M)]), closed=False, free=True, speed=0.35, error=0.005),
         Stroke(np.array([at(reach, height)]), closed=True, speed=0.14, error=0.0015),
         Stroke(np.array([at(reach + shape.travel + PULL_FURTHER_M, height)]), closed=True, speed=0.12),
     ]

@@ -80,7 +80,7 @@ def pick(env: PickBananaEnv, rng: np.random.Generator) -> list[Stroke]:
     yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
     lift = LIFT_M + rng.uniform(-0.02, 0.02)
     return [
-        Stroke(np.array([downward(x, y, ABOVE_M, yaw)]), closed=False, speed=0.35, error=0.005),
+        Stroke(np.array([downward(x, y, ABOVE_M, yaw)]), closed=False, free=True, speed=0.35, error=0.005),
         Stroke(np.array([downward(x, y, GRASP_HEIGHT_M, yaw)]), closed=True, speed=0.14, error=0.0015),
         Stroke(np.array([downward(x, y, lift, yaw)]), closed=True, speed=0.16, error=0.005),
     ]

@@ -72,10 +72,10 @@ def push(env: PushCubeEnv, rng: np.random.Generator) -> list[Stroke]:
     behind = x - CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M - APPROACH_M
     end = x + GOAL_DISTANCE_M - CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
     return [
-        Stroke(np.array([downward(behind, y, CLEARANCE_M)]), closed=True, speed=0.35, error=0.004),
+        Stroke(np.array([downward(behind, y, CLEARANCE_M)]), closed=True, free=True, speed=0.35, error=0.004),
         Stroke(np.array([downward(behind, y, PUSH_HEIGHT_M)]), closed=True, speed=0.15),
         Stroke(np.array([downward(end, y, PUSH_HEIGHT_M)]), closed=True, speed=0.18),
-        Stroke(np.array([downward(end - APPROACH_M, y, CLEARANCE_M)]), closed=True, error=0.006),
+        Stroke(np.array([downward(end - APPROACH_M, y, CLEARANCE_M)]), closed=True, free=True, error=0.006),
     ]
 
 

@@ -185,12 +185,12 @@ def turn(env: TurnFaucetEnv, rng: np.random.Generator) -> list[Stroke]:
 
     end = shape.turn + PUSH_FURTHER_RAD
     return [
-        Stroke(np.array([at(0.0, APPROACH_M, height + ABOVE_M)]), closed=True, speed=0.35, error=0.005),
+        Stroke(np.array([at(0.0, APPROACH_M, height + ABOVE_M)]), closed=True, free=True, speed=0.35, error=0.005),
         Stroke(np.array([at(0.0, APPROACH_M, height)]), closed=True, speed=0.15, error=0.003),
         Stroke(
             np.array([at(turned, 0.0, height) for turned in np.linspace(0.0, end, ARC_POINTS)]), closed=True, speed=0.13
         ),
-        Stroke(np.array([at(end, APPROACH_M, height + 0.03)]), closed=True, error=0.005),
+        Stroke(np.array([at(end, APPROACH_M, height + 0.03)]), closed=True, free=True, error=0.005),
     ]
 
 
