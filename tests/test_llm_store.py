@@ -113,6 +113,24 @@ def test_samples_that_never_came_are_missing_again_in_the_replay(tmp_path):
     assert [[a.text for a in own] for own in replayed] == [[a.text for a in own] for own in recorded]
 
 
+def test_a_sample_that_was_kept_before_stays_what_it_was(tmp_path):
+    class Fickle(CountingModel):
+        def sample(self, queries, n, *, first_index=0, on_answer=None, **_):
+            self.asked += 1
+            answers = [Answer(f"{self.asked}") for _ in range(n)]
+            for number, answer in enumerate(answers):
+                on_answer(0, first_index + number, 0, answer, True)
+            return [answers]
+
+    store = SampleStore(tmp_path / "s.sqlite")
+    recorded = RecordedModel(Fickle(), store)
+    recorded.sample(QUERIES[:1], 3, temperature=0.5)
+    five = recorded.sample(QUERIES[:1], 5, temperature=0.5)
+    assert [answer.text for answer in five[0]] == ["1", "1", "1", "2", "2"]
+    replayed = ReplayedModel(store, "counting").sample(QUERIES[:1], 5, temperature=0.5)
+    assert [answer.text for answer in replayed[0]] == ["1", "1", "1", "2", "2"]
+
+
 def test_a_file_that_is_no_store_is_refused_in_one_line(tmp_path):
     path = tmp_path / "notes.txt"
     path.write_text("these are my notes, not a database " * 100)

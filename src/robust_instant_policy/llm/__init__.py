@@ -1,7 +1,7 @@
 """Language models: any server that speaks OpenAI's protocol, any llama.cpp model file, and one that is embedded."""
 
-from robust_instant_policy.llm.connect import connect
+from robust_instant_policy.llm.connect import connect, model_name
 from robust_instant_policy.llm.model import LanguageModel
 from robust_instant_policy.llm.store import RecordedModel, ReplayedModel, SampleStore
 
-__all__ = ["LanguageModel", "RecordedModel", "ReplayedModel", "SampleStore", "connect"]
+__all__ = ["LanguageModel", "RecordedModel", "ReplayedModel", "SampleStore", "connect", "model_name"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 from urllib.parse import urlsplit
@@ -11,7 +12,10 @@ from robust_instant_policy.llm.model import LanguageModel
 
 FORMS = "'embedded', 'gguf:PATH', 'openai:MODEL', 'http://HOST:PORT/v1#MODEL'"
 OPENAI_URL = "https://api.openai.com/v1"
-STYLES: tuple[Literal["chat", "completions"], ...] = ("chat", "completions")
+EMBEDDED_NAME = "gemma-3-270m-q4_k_m-numbers"
+
+Style = Literal["chat", "completions"]
+STYLES: tuple[Style, ...] = ("chat", "completions")
 
 
 def connect(spec: str) -> LanguageModel:
@@ -25,28 +29,49 @@ def connect(spec: str) -> LanguageModel:
 
     Raises `UsageError` for anything else, `ModelError` when the model cannot be loaded.
     """
+    return _parse(spec)[1]()
+
+
+def model_name(spec: str) -> str:
+    """The name under which a store keeps the answers of the model that ``spec`` names, without loading the model."""
+    return _parse(spec)[0]
+
+
+def _parse(spec: str) -> tuple[str, Callable[[], LanguageModel]]:
+    """The model's name, and what makes it. The imports wait until then: they take longer than all the rest."""
     kind, _, rest = spec.partition(":")
     if spec == "embedded":
-        from robust_instant_policy.llm.gemma import load_embedded
-
-        return load_embedded()
+        return EMBEDDED_NAME, _embedded
     if kind == "gguf" and rest:
-        from robust_instant_policy.llm.llama import LlamaModel
-
-        return LlamaModel(Path(rest).expanduser())
+        path = Path(rest).expanduser()
+        return path.stem, lambda: _gguf(path)
     if kind == "openai" and rest:
-        from robust_instant_policy.llm.endpoint import Endpoint
-
-        return Endpoint(OPENAI_URL, rest, style="chat")
+        return rest, lambda: _endpoint(OPENAI_URL, rest, "chat")
     forced = next((style for style in STYLES if spec.startswith(style + "+")), None)
     address = spec if forced is None else spec.removeprefix(forced + "+")
     if address.startswith(("http://", "https://")):
-        from robust_instant_policy.llm.endpoint import Endpoint
-
         url, _, model = address.partition("#")
         if urlsplit(url).username is not None:
             raise UsageError("a key does not belong into the address; put it into the variable OPENAI_API_KEY")
         if not urlsplit(url).hostname or not model:
             raise UsageError("an address needs its model behind a #, as in http://localhost:8000/v1#my-model")
-        return Endpoint(url, model, style=forced)
+        return model, lambda: _endpoint(url, model, forced)
     raise UsageError(f"unknown language model {spec!r}; known forms: {FORMS}")
+
+
+def _embedded() -> LanguageModel:
+    from robust_instant_policy.llm.gemma import load_embedded
+
+    return load_embedded()
+
+
+def _gguf(path: Path) -> LanguageModel:
+    from robust_instant_policy.llm.llama import LlamaModel
+
+    return LlamaModel(path)
+
+
+def _endpoint(url: str, model: str, style: Style | None) -> LanguageModel:
+    from robust_instant_policy.llm.endpoint import Endpoint
+
+    return Endpoint(url, model, style)

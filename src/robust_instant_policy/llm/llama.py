@@ -51,6 +51,17 @@ class _Layout:
 
 
 @dataclass(eq=False)
+class _Deadline:
+    """The moment at which everything stops; brought forward when something goes wrong."""
+
+    at: float
+
+    @property
+    def has_passed(self) -> bool:
+        return time.monotonic() > self.at
+
+
+@dataclass(eq=False)
 class _Slot:
     """A place in a server that remembers the last text it read."""
 
@@ -99,7 +110,7 @@ class LlamaModel:
         on_answer: OnAnswer | None = None,
     ) -> list[list[Answer]]:
         """See `LanguageModel.sample`."""
-        deadline = time.monotonic() + deadline_s
+        deadline = _Deadline(time.monotonic() + deadline_s)
         tally = Tally(len(queries), n, first_index, accept, on_progress, on_answer)
         if not queries or n < 1:
             return tally.answers()
@@ -118,14 +129,14 @@ class LlamaModel:
         self._servers, self._slots, self._layout = [], [], None
 
     def _ask_apart(
-        self, queries: Sequence[Query], tally: Tally, temperature: float, seed: int, deadline: float
+        self, queries: Sequence[Query], tally: Tally, temperature: float, seed: int, deadline: _Deadline
     ) -> None:
         self._assign(queries)
 
         def work(slot: _Slot) -> None:
             for index in slot.queue:
                 query = queries[index]
-                while (missing := tally.missing(index)) and time.monotonic() < deadline:
+                while (missing := tally.missing(index)) and not deadline.has_passed:
                     request = _request(query, temperature, _seed(seed, missing[0], tally.attempt(index, missing[0])))
                     request["id_slot"] = slot.number
                     slot.text = query.text
@@ -134,8 +145,12 @@ class LlamaModel:
 
         busy = [slot for slot in self._slots if slot.queue]
         with ThreadPoolExecutor(len(busy)) as pool:
-            for _ in pool.map(work, busy):
-                pass
+            try:
+                for _ in pool.map(work, busy):
+                    pass
+            except BaseException:
+                deadline.at = 0.0  # the others stop at their next token
+                raise
 
     def _assign(self, queries: Sequence[Query]) -> None:
         """Give each query to the slot that has read most of it already, as evenly as they go."""
@@ -167,9 +182,9 @@ class LlamaModel:
                 ).queue.append(index)
 
     def _ask_together(
-        self, index: int, query: Query, tally: Tally, temperature: float, seed: int, deadline: float
+        self, index: int, query: Query, tally: Tally, temperature: float, seed: int, deadline: _Deadline
     ) -> None:
-        while (missing := tally.missing(index)) and time.monotonic() < deadline:
+        while (missing := tally.missing(index)) and not deadline.has_passed:
             together = missing[:LONG_SLOTS]
             request = _request(query, temperature, _seed(seed, together[0], tally.attempt(index, together[0])))
             request["n"] = len(together)
@@ -245,7 +260,7 @@ def _request(query: Query, temperature: float, seed: int) -> dict[str, Any]:
     return request
 
 
-def _complete(server: Any, request: dict[str, Any], count: int, deadline: float) -> list[Answer]:
+def _complete(server: Any, request: dict[str, Any], count: int, deadline: _Deadline) -> list[Answer]:
     """The ``count`` answers to one request, or none when the deadline passes first."""
     pieces: list[list[str]] = [[] for _ in range(count)]
     usage: dict[str, Any] = {}
@@ -260,12 +275,12 @@ def _complete(server: Any, request: dict[str, Any], count: int, deadline: float)
             if choice["text"]:
                 pieces[choice["index"]].append(choice["text"])
         usage.update(chunk.get("usage") or {})
-        return time.monotonic() > deadline
+        return deadline.has_passed
 
     server.handle_completions(request, receive)
     if failure:
         raise ModelError(f"llama.cpp refused the prompt: {failure[0]}")
-    if time.monotonic() > deadline:
+    if deadline.has_passed:
         return []
     seconds = time.monotonic() - start
     cached = usage.get("prompt_tokens_details", {}).get("cached_tokens", 0)

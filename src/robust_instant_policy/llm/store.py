@@ -206,7 +206,10 @@ class RecordedModel:
             if len(answers) < n:
                 for sample in range(first_index, first_index + n):
                     self._store.write(self.name, asked[position], settings, sample, _NOTHING_CAME, None)
-            found[unasked[position]] = answers
+        # What the store holds now, not what came: a sample that was there already stays what it was.
+        kept, _ = _look_up(self._store, self.name, queries, n, settings, first_index, accept, None)
+        for index in unasked:
+            found[index] = [replace(answer, replayed=False) for answer in kept[index]]
         return found
 
     def close(self) -> None:
