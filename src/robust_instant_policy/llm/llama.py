@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import threading
 import time
 import urllib.request
@@ -85,14 +86,15 @@ class LlamaModel:
         self._servers: list[Any] = []
         self._slots: list[_Slot] = []
         self._lock = threading.Lock()
+        # The servers listen on this machine's loopback address; nobody else is to use them.
+        self._key = secrets.token_hex(16)
 
     def count_tokens(self, text: str) -> int:
         if not self._servers:
             self._start(_short_layout(SHORT_TOKENS))
         body = json.dumps({"content": text, "add_special": True}).encode()
-        request = urllib.request.Request(
-            self._servers[0].listening_address + "/tokenize", body, {"Content-Type": "application/json"}
-        )
+        headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self._key}"}
+        request = urllib.request.Request(self._servers[0].listening_address + "/tokenize", body, headers)
         with urllib.request.urlopen(request, timeout=30) as response:
             return len(json.load(response)["tokens"])
 
@@ -227,6 +229,7 @@ class LlamaModel:
     def _params(self, xllamacpp: Any, layout: _Layout) -> Any:
         params = xllamacpp.CommonParams()
         params.model.path = str(self._path)
+        params.api_keys = [self._key]
         params.n_parallel = layout.slots
         params.kv_unified = layout.is_long
         params.n_ctx = layout.tokens if layout.is_long else layout.tokens * layout.slots
