@@ -215,6 +215,7 @@ def as_line(row: Row, outcome: Outcome) -> str:
         cost([float(value) for value in outcome.tokens], ".0f"),
         cost(outcome.seconds, ".1f"),
         cost(outcome.cpu_seconds, ".1f"),
+        f"{os.getloadavg()[2]:.1f} on {os.cpu_count()} cores",
     )
     return "| " + " | ".join(cells) + " |"
 
@@ -247,6 +248,7 @@ COLUMNS = (
     "tokens a plan, first / later",
     "seconds, first / later",
     "CPU seconds, first / later",
+    "load of the machine",
 )
 HEADER = "| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS) + "\n"
 
@@ -276,17 +278,26 @@ def main() -> None:
                     scenes = args.sequence_scenes if layout == "sequence" else args.scenes
                     lines.append(as_line(row, measure(row, world, scenes, args)))
                     print(lines[-1], flush=True)
+    if args.out is not None:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        lines = merged(args.out.read_text().splitlines() if args.out.exists() else [], lines)
     table = (
-        f"{NUM_DEMOS} demonstrations, Q = {args.samples}, temperature {args.temperature:g}, objects {args.world}, "
-        f"{os.cpu_count()} cores with a load of {os.getloadavg()[2]:.1f} by the machine's other work.\n\n"
+        "Written by `benchmarks/prompting.py`, a row at a time. "
+        f"{NUM_DEMOS} demonstrations, Q = {args.samples}, temperature {args.temperature:g}.\n\n"
         + HEADER
         + "\n".join(lines)
         + "\n"
     )
     print("\n" + table)
     if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(table)
+
+
+def merged(old: list[str], new: list[str]) -> list[str]:
+    """Rows of earlier runs that were not measured again, and the new ones."""
+    names = [line.split("|")[1:3] for line in new]
+    rows = [line for line in old if line.startswith("| ") and line.split("|")[1:3] not in names]
+    return sorted([*(row for row in rows if row not in HEADER and not row.startswith("| ---")), *new])
 
 
 if __name__ == "__main__":

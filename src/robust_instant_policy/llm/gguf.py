@@ -71,10 +71,6 @@ class Header:
         """Tokens the model was trained to look back on."""
         return self.value(f"{self.value('general.architecture')}.context_length")
 
-    @property
-    def has_chat_template(self) -> bool:
-        return "tokenizer.chat_template" in self.fields
-
 
 def read_header(path: Path) -> Header:
     """The header of the GGUF file at ``path``; `ModelError` when it is not one."""

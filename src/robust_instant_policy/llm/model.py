@@ -118,16 +118,6 @@ class Tally:
             return [[answer for _, answer in sorted(accepted.items())] for accepted in self._accepted]
 
 
-def refuse_long_prompts(model: LanguageModel, queries: Sequence[Query]) -> None:
-    """Raise `ModelError` for the first query that does not fit into the model's context together with its answer."""
-    if model.context_length is None:
-        return
-    for query in queries:
-        tokens = model.count_tokens((query.instruction or "") + query.text)
-        if tokens + query.max_tokens > model.context_length:
-            raise context_error(tokens, query.max_tokens, model.context_length, model.counts_exactly)
-
-
 def context_error(prompt_tokens: int, answer_tokens: int, context_length: int, exact: bool = True) -> ModelError:
     return ModelError(
         f"the prompt has {'' if exact else 'about '}{prompt_tokens} tokens and the answer needs up to {answer_tokens}, "
