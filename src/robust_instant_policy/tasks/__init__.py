@@ -13,10 +13,11 @@ from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Imag
 TASK_NAMES = ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")
 
 
-def make_task(name: str, objects: str = "seen") -> Task:
+def make_task(name: str, objects: str = "seen", assets: str = "code") -> Task:
     """The task called ``name``, one of `TASK_NAMES`.
 
-    ``objects="unseen"`` takes objects that no demonstration shows, for the tasks that have two sets.
+    ``objects="unseen"`` takes objects that no demonstration shows, for the tasks that have two sets;
+    ``assets="maniskill"`` takes YCB and PartNet-Mobility models, where they have been downloaded for ManiSkill.
 
     Raises `UnknownNameError` for other names, `MissingExtraError` where its simulator is not installed, and
     `RendererError` where nothing can render its camera.
@@ -30,10 +31,11 @@ def make_task(name: str, objects: str = "seen") -> Task:
         if error.name and error.name.startswith("robust_instant_policy"):
             raise
         raise MissingExtraError(error.name or "mani_skill", "sim") from error
-    object_sets = module.SPEC.object_sets or ("seen",)
-    if objects not in object_sets:
-        raise UnknownNameError(f"set of objects of {name}", objects, object_sets)
-    task: Task = simulated.SimulatedTask(module.SPEC, objects)
+    if objects not in module.SPEC.object_sets:
+        raise UnknownNameError(f"set of objects of {name}", objects, module.SPEC.object_sets)
+    if assets not in module.SPEC.asset_sources:
+        raise UnknownNameError(f"source of assets of {name}", assets, module.SPEC.asset_sources)
+    task: Task = simulated.SimulatedTask(module.SPEC, objects, assets)
     return task
 
 

@@ -44,7 +44,17 @@ class CellEnv(BaseEnv):
     SUPPORTED_REWARD_MODES = ("sparse", "none")
     agent: UR5eHandE
 
-    def __init__(self, *args: Any, robot_uids: str = "ur5e_hande", render_backend: str = "cpu", **kwargs: Any):
+    def __init__(
+        self,
+        *args: Any,
+        robot_uids: str = "ur5e_hande",
+        render_backend: str = "cpu",
+        objects: str = "seen",
+        assets: str = "code",
+        **kwargs: Any,
+    ):
+        """``objects`` and ``assets`` as in `tasks.make_task`; everything else as in ManiSkill's environments."""
+        self.objects, self.assets = objects, assets
         # A physics scene that has been used orders its contacts differently from a new one, and the same push then
         # ends millimetres elsewhere: only a new scene at every reset makes the same seed give the same episode.
         kwargs.setdefault("reconfiguration_freq", 1)

@@ -9,15 +9,18 @@ import sapien
 import sapien.physx
 import sapien.render
 import torch
+from mani_skill.utils.building import actors
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs.actor import Actor
 from scipy.spatial.transform import Rotation
 
+from robust_instant_policy.geometry import FloatArray, invert_pose
+from robust_instant_policy.tasks.maniskill import partnet
 from robust_instant_policy.tasks.maniskill.banana import Banana
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill.paint import texture
-from robust_instant_policy.tasks.maniskill.poses import downward
+from robust_instant_policy.tasks.maniskill.poses import downward, facing
 from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.08, 0.16), (-0.15, 0.15)
@@ -37,45 +40,60 @@ class PickBananaEnv(CellEnv):
     """Success: the banana is off the table between both fingers, and the arm is still."""
 
     banana: Actor
-    shape: Banana
+    lie: FloatArray  # the frame of `Banana` in the actor's own
+    rest_height: float  # of the banana's middle over the table
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
-        self.shape = Banana.draw(self.draw("shape"))
-        builder = self.scene.create_actor_builder()
-        friction = sapien.physx.PhysxMaterial(SKIN_FRICTION, SKIN_FRICTION, 0.0)
-        for start, stop, radius in self.shape.capsules():
-            turn = Rotation.align_vectors((stop - start)[None], [[1.0, 0.0, 0.0]])[0].as_quat()[[3, 0, 1, 2]]
-            builder.add_capsule_collision(
-                sapien.Pose((start + stop) / 2, turn),
-                radius,
-                float(np.linalg.norm(stop - start)) / 2,
-                material=friction,
-                density=DENSITY,
-            )
-        skin = sapien.render.RenderMaterial()
-        skin.base_color, skin.roughness, skin.specular = [1.0, 1.0, 1.0, 1.0], 0.55, 0.3
-        skin.base_color_texture = texture(self.shape.skin())
-        builder._procedural_shapes.append(sapien.render.RenderShapeTriangleMesh(*self.shape.mesh(), skin))
-        builder.initial_pose = sapien.Pose([0, 0, self.shape.radius])
-        self.banana = builder.build(name="banana")
+        if self.assets == "maniskill":
+            partnet.require_banana()
+            builder = actors.get_actor_builder(self.scene, id=f"ycb:{partnet.YCB_BANANA}")
+            builder.initial_pose = sapien.Pose([0, 0, 0.1])
+            self.banana = builder.build(name="banana")
+            mesh = self.banana.get_first_collision_mesh(to_world_frame=False)
+            self.lie = partnet.banana_frame(mesh)
+            self.rest_height = float(self.lie[2, 3] - mesh.bounds[0, 2])
+        else:
+            shape = Banana.draw(self.draw("shape"))
+            self.banana = _build(shape, self.scene)
+            self.lie, self.rest_height = np.eye(4), shape.radius
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
         rng = self.draw("pose")
-        x, y = rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M)
-        yaw = rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD)
-        self.banana.set_pose(sapien.Pose([x, y, self.shape.radius], [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
+        pose = facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
+        pose[2, 3] = self.rest_height
+        self.banana.set_pose(sapien.Pose(pose @ invert_pose(self.lie)))
+
+    def middle(self) -> FloatArray:
+        """The banana's frame ``(4, 4)`` in the world: its middle, x along the fruit."""
+        return self.banana.pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64) @ self.lie
 
     def evaluate(self) -> dict:
-        lifted = self.banana.pose.p[:, 2] > self.shape.radius + LIFTED_M
+        lifted = torch.tensor([self.middle()[2, 3] > self.rest_height + LIFTED_M])
         held = self.agent.is_grasping(self.banana)
         return {"success": lifted & held & self.arm_is_still(), "lifted": lifted, "held": held}
 
 
+def _build(shape: Banana, scene: Any) -> Actor:
+    builder = scene.create_actor_builder()
+    friction = sapien.physx.PhysxMaterial(SKIN_FRICTION, SKIN_FRICTION, 0.0)
+    for start, stop, radius in shape.capsules():
+        turn = Rotation.align_vectors((stop - start)[None], [[1.0, 0.0, 0.0]])[0].as_quat()[[3, 0, 1, 2]]
+        half_length = float(np.linalg.norm(stop - start)) / 2
+        pose = sapien.Pose((start + stop) / 2, turn)
+        builder.add_capsule_collision(pose, radius, half_length, material=friction, density=DENSITY)
+    skin = sapien.render.RenderMaterial()
+    skin.base_color, skin.roughness, skin.specular = [1.0, 1.0, 1.0, 1.0], 0.55, 0.3
+    skin.base_color_texture = texture(shape.skin())
+    builder._procedural_shapes.append(sapien.render.RenderShapeTriangleMesh(*shape.mesh(), skin))
+    builder.initial_pose = sapien.Pose([0, 0, shape.radius])
+    return builder.build(name="banana")
+
+
 def pick(env: PickBananaEnv, rng: np.random.Generator) -> list[Stroke]:
     """Come down over the middle, fingers across the fruit, close, lift and hold."""
-    pose = env.banana.pose.to_transformation_matrix()[0].numpy()
+    pose = env.middle()
     x, y = pose[:2, 3].tolist()
     yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
     lift = LIFT_M + rng.uniform(-0.02, 0.02)

@@ -97,4 +97,5 @@ SPEC = TaskSpec(
     env_id="RIP-PushCube-v1",
     expert=push,
     verdict=verdict,
+    asset_sources=("code",),
 )

@@ -36,7 +36,8 @@ class TaskSpec:
     """What makes a task: its environment, what the person does in it, and why it failed, in words.
 
     ``expert(env, rng)`` sees the simulator's state, as a person sees the scene; ``verdict(env)`` returns the
-    reason of failure, or nothing after success. ``object_sets`` are the sets of objects to choose from, if any.
+    reason of failure, or nothing after success. ``object_sets`` and ``asset_sources`` are what there is to
+    choose from.
     """
 
     name: str
@@ -45,7 +46,8 @@ class TaskSpec:
     env_id: str
     expert: Expert
     verdict: Verdict
-    object_sets: tuple[str, ...] = ()
+    object_sets: tuple[str, ...] = ("seen",)
+    asset_sources: tuple[str, ...] = ("code", "maniskill")
 
 
 class SimulatedTask:
@@ -56,12 +58,11 @@ class SimulatedTask:
     video_hz = VIDEO_HZ
     workspace = WORKSPACE
 
-    def __init__(self, spec: TaskSpec, objects: str):
+    def __init__(self, spec: TaskSpec, objects: str, assets: str):
         require_renderer()
         self.name, self.description, self.goal = spec.name, spec.description, spec.goal
         self._spec = spec
-        options = {"objects": objects} if spec.object_sets else {}
-        self._env = gymnasium.make(spec.env_id, obs_mode="none", reward_mode="none", **options)
+        self._env = gymnasium.make(spec.env_id, obs_mode="none", reward_mode="none", objects=objects, assets=assets)
         self._cell: CellEnv = self._env.unwrapped
         # The simulator searches the whole process for garbage whenever it rebuilds a scene. What lives by now (torch
         # and its like) lives on; sparing it makes a reset several times faster.
