@@ -78,6 +78,15 @@ def test_execution_does_not_depend_on_what_was_executed_before(task, attempt):
     assert not np.array_equal(endings[0], endings[1])
 
 
+def test_executing_twice_starts_again_from_the_scene_of_the_last_reset(task, attempt):
+    trajectory = downsample(attempt.demonstration.trajectory)
+    task.reset(3)
+    task.execute(trajectory)
+    first = task.scene_truth().poses
+    task.execute(trajectory)
+    np.testing.assert_array_equal(task.scene_truth().poses, first)
+
+
 @pytest.mark.parametrize("method", ["masked", "uniform"])
 def test_a_demonstration_replays_in_its_own_scene(task, attempt, method):
     task.reset(3)

@@ -63,7 +63,7 @@ def require_banana() -> None:
 
 def load_chest(scene: Any, rng: np.random.Generator) -> tuple[Mechanism, Drawer]:
     """A chest with a drawer whose handle fits between the fingers from above."""
-    return _load(scene, "cabinet_drawer", "partnet_mobility_cabinet", "seen and unseen", rng, _measure_drawer)
+    return _load(scene, "cabinet_drawer", "partnet_mobility_cabinet", None, rng, _measure_drawer)
 
 
 def load_cabinet(scene: Any, objects: str, rng: np.random.Generator) -> tuple[Mechanism, Door]:
@@ -103,14 +103,14 @@ def _load(
     scene: Any,
     category: str,
     download: str,
-    objects: str,
+    objects: str | None,
     rng: np.random.Generator,
     measure: Callable[[_Model, Any], Geometry | None],
 ) -> tuple[Mechanism, Geometry]:
     """The first model, in the order of ``rng``, with a joint that ``measure`` finds the hand can work."""
     info = json.loads((PACKAGE_ASSET_DIR / "partnet_mobility" / "meta" / f"info_{category}_train.json").read_text())
     installed = sorted(model for model in info if _urdf(model) is not None)
-    if objects in ("seen", "unseen"):
+    if objects is not None:  # every other model is one that demonstrations never show
         installed = installed[objects == "unseen" :: 2]
     for model_id in rng.permutation(installed):
         scale = info[model_id]["scale"] if category == "faucet" else TABLETOP_SCALE
@@ -122,7 +122,7 @@ def _load(
                 resist(model.articulation, joint.name, damping, FRICTION)
                 return Mechanism(model.articulation, joint.name, joint.child_link.name, model.origin), geometry
         scene.remove_articulation(model.articulation)
-    raise MissingAssetsError(f"{objects} object of {category} that the hand can work", PARTNET_FOLDER, download)
+    raise MissingAssetsError(f"model of {category} that the hand can work", PARTNET_FOLDER, download)
 
 
 def _urdf(model_id: str) -> Path | None:

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import UnreachableError
+from robust_instant_policy.errors import RipError, UnreachableError
 from robust_instant_policy.tasks.maniskill.cell import BASE_POSITION_M, HOME_JOINTS, RECORD_HZ, WORKSPACE, CellEnv
 from robust_instant_policy.tasks.maniskill.demonstrator import Stroke, perform
 from robust_instant_policy.tasks.maniskill.kinematics import Kinematics
@@ -70,15 +70,17 @@ class SimulatedTask:
         gc.freeze()
         self._kinematics = Kinematics(BASE_POSITION_M)
         self._seed: int | None = None
+        self._fresh = False  # nothing has moved since the scene was built
 
     def reset(self, seed: int) -> Observation:
-        self._env.reset(seed=seed)
-        self._seed = seed
+        self._rebuild(seed)
         return self._cell.photograph()
 
     def execute(self, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
         if self._seed is None:
-            raise UnreachableError("there is no scene to execute in; call reset(seed) first")
+            raise RipError("there is no scene to execute in; call reset(seed) first")
+        if not self._fresh:
+            self._rebuild(self._seed)
         motion = plan_waypoints(trajectory, self._kinematics, HOME_JOINTS, RECORD_HZ)
         tracking_error = self._play(motion, on_frame)
         failure = self._spec.verdict(self._cell)
@@ -108,6 +110,10 @@ class SimulatedTask:
         """What the camera's pixels show: for measuring perception, never for a policy."""
         return self._cell.scene_truth()
 
+    def _rebuild(self, seed: int) -> None:
+        self._env.reset(seed=seed)
+        self._seed, self._fresh = seed, True
+
     def close(self) -> None:
         self._env.close()
         gc.unfreeze()
@@ -115,6 +121,7 @@ class SimulatedTask:
     def _play(self, motion: Motion, on_frame: FrameSink | None, images: list[np.ndarray] | None = None) -> float:
         """Run the commands; the largest distance between the palm commanded and reached, in metres."""
         palm = np.array([0.0, 0.0, -PALM_TRIANGLE.length])
+        self._fresh = False
         worst = 0.0
         for step, (joints, fingers, pose) in enumerate(zip(motion.joints, motion.fingers, motion.poses, strict=True)):
             if images is not None:
