@@ -23,6 +23,10 @@ def main(check: bool) -> int:
     stale = []
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         text = page.read_text()
+        missing = [file for _, file, _ in BLOCK.findall(text) if not (ROOT / file).exists()]
+        if missing:
+            print(f"{page.name} includes {', '.join(missing)}, which is not there")
+            return 1
         if included(text) != text:
             stale.append(page.name)
             if not check:

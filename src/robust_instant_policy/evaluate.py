@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from robust_instant_policy.console import StageConsole
-from robust_instant_policy.errors import UnknownNameError, UsageError
+from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.evaluation import Episode, Experiment, run_experiment, success_table
-from robust_instant_policy.llm import RecordedModel, ReplayedModel, SampleStore, connect
+from robust_instant_policy.llm import RecordedModel, ReplayedModel, SampleStore, connect, model_name
 from robust_instant_policy.policies import METHOD_NAMES, InstantPolicy
 from robust_instant_policy.tasks import TASK_NAMES
 from robust_instant_policy.tasks.task import Task
@@ -33,7 +33,7 @@ def evaluate(
     screen = StageConsole()
     out.mkdir(parents=True, exist_ok=True)
     store = SampleStore(out / STORE_FILE)
-    model = _replayed(store, llm_spec) if replay else RecordedModel(connect(llm_spec), store)
+    model = ReplayedModel(store, model_name(llm_spec)) if replay else RecordedModel(connect(llm_spec), store)
 
     def make_instant(task: Task) -> InstantPolicy:
         return InstantPolicy(model, workspace=task.workspace, **options)
@@ -58,13 +58,3 @@ def evaluate(
     screen.say("")
     screen.say(success_table(table.rows))
     screen.say(f"rows: {table.path}")
-
-
-def _replayed(store: SampleStore, llm_spec: str) -> ReplayedModel:
-    names = [held.model for held in store.models()]
-    if llm_spec not in names and len(names) != 1:
-        raise UsageError(
-            f"{store.path} holds answers of {', '.join(names) or 'no model'}; "
-            + ("say which with --llm NAME" if names else "run once without --replay")
-        )
-    return ReplayedModel(store, llm_spec if llm_spec in names else names[0])

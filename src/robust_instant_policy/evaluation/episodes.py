@@ -28,7 +28,7 @@ class Episode:
 
     ``objects`` are "seen" in the demonstrations or "unseen"; ``candidate`` numbers the executions of one plan
     (0 where there is one); ``seconds`` is the wall time of planning; ``executed_seconds`` the time the robot
-    moved; ``failure`` says in words what went wrong and is empty on success; ``tokens`` counts those given and
+    moved; ``failure`` says in words what went wrong and is empty on success; ``tokens`` counts those read and
     written; ``confidence`` is the plan's.
     """
 

@@ -103,7 +103,8 @@ class InstantPolicy:
             heard = self._heard = _Heard(observation, located, watch.stages[0], queries, [[] for _ in queries])
         self._ask(heard, num_queries)
         answers = [of_query[:num_queries] for of_query in heard.answers]
-        count = min(len(of_query) for of_query in answers)
+        # Where the demonstrations agree on every number there is nothing to ask, and every candidate is the same.
+        count = min((len(of_query) for of_query in answers), default=num_queries)
         if count < min(MIN_VALID_ANSWERS, num_queries):
             raise PlanningError(_too_few(count, num_queries, answers, heard.seconds))
         candidates = tuple(
@@ -117,7 +118,7 @@ class InstantPolicy:
 
     def _ask(self, heard: _Heard, num_queries: int) -> None:
         """Sample what ``heard`` lacks of ``num_queries`` answers a query."""
-        if heard.num_asked >= num_queries:
+        if heard.num_asked >= num_queries or not heard.queries:
             return
         start = time.perf_counter()
         more = self.llm.sample(

@@ -55,8 +55,8 @@ class Usage:
 
     @property
     def tokens(self) -> int:
-        """Tokens the model was given and wrote, cached or not."""
-        return sum(stage.prompt_tokens + stage.completion_tokens for stage in self.stages)
+        """Tokens the model had to read and write: what it had read before is not counted again."""
+        return sum(stage.prompt_tokens - stage.cached_tokens + stage.completion_tokens for stage in self.stages)
 
 
 class Stopwatch:
