@@ -61,39 +61,60 @@ def plan_waypoints(trajectory: Trajectory, kinematics: Kinematics, home: ArrayLi
     depth = -PALM_TRIANGLE.triplets(waypoints)[..., 2].min(axis=-1)
     _refuse(depth > TABLE_TOLERANCE_M, "fingers {:.0f} mm inside the table", depth * 1e3)
 
-    closed = trajectory.gripper_state[:, 0] > CLOSED
-    lead_in = _lead_in(kinematics.tool_pose(home), waypoints[0])
-    knots, owner, times, command = [lead_in[0]], [0], [0.0], [False]
-    for pose in lead_in[1:]:
-        distance = float(np.linalg.norm(pose[:3, 3] - knots[-1][:3, 3]))
-        if distance > 0 or pose is lead_in[-1]:
-            knots.append(pose)
-            owner.append(0)
-            times.append(times[-1] + max(distance / LEAD_IN_SPEED_M_S, 1 / EXECUTE_HZ))
-            command.append(False)
-    for step, (pose, shut) in enumerate(zip(waypoints, closed, strict=True)):
+    schedule = _Schedule(kinematics.tool_pose(home))
+    first = waypoints[0]
+    over = first.copy()  # travel at the height of the higher one, then go down
+    over[2, 3] = max(schedule.pose[2, 3], first[2, 3])
+    for pose in (over, first):
+        schedule.go(pose, 0, LEAD_IN_SPEED_M_S)
+    for step, (pose, shut) in enumerate(zip(waypoints, trajectory.gripper_state[:, 0] > CLOSED, strict=True)):
         if step:
-            distance = float(np.linalg.norm(pose[:3, 3] - knots[-1][:3, 3]))
-            knots.append(pose)
-            owner.append(step)
-            times.append(times[-1] + max(1 / EXECUTE_HZ, 2 * distance / TOOL_SPEED_LIMIT_M_S))
-            command.append(command[-1])
-        if shut != command[-1]:
-            command[-1] = bool(shut)
-            knots.append(pose)
-            owner.append(step)
-            times.append(times[-1] + GRIPPER_SECONDS)
-            command.append(bool(shut))
-    knots.append(knots[-1])
-    owner.append(owner[-1])
-    times.append(times[-1] + SETTLE_SECONDS)
-    command.append(command[-1])
+            schedule.go(pose, step, TOOL_SPEED_LIMIT_M_S / 2)  # the cubic is up to twice as fast as its mean
+        if shut != schedule.shut:
+            schedule.wait(GRIPPER_SECONDS, bool(shut))
+    schedule.wait(SETTLE_SECONDS, schedule.shut)
 
-    at = np.arange(0.0, times[-1] + 0.5 / rate_hz, 1 / rate_hz).clip(max=times[-1])
-    poses = _smooth(np.array(times), np.array(knots), at)
-    state = np.array(command)[np.clip(np.searchsorted(times, at, side="right") - 1, 0, None)]
-    reached_for = np.array(owner)[np.clip(np.searchsorted(times, at, side="left"), 0, len(owner) - 1)]
-    return plan_poses(poses, state, kinematics, home, rate_hz, reached_for)
+    end = schedule.times[-1]
+    at = np.arange(0.0, end + 0.5 / rate_hz, 1 / rate_hz).clip(max=end)
+    arriving = np.searchsorted(schedule.times, at, side="left").clip(max=len(schedule.times) - 1)
+    leaving = (np.searchsorted(schedule.times, at, side="right") - 1).clip(min=0)
+    poses = _smooth(np.array(schedule.times), np.array(schedule.poses), at)
+    closed, steps = np.array(schedule.closed)[leaving], np.array(schedule.steps)[arriving]
+    return plan_poses(poses, closed, kinematics, home, rate_hz, steps)
+
+
+class _Schedule:
+    """When the tool is to be where: poses ``(4, 4)`` at increasing times, from ``start`` at time 0, hand open.
+
+    ``closed`` is the gripper command from each time on, ``steps`` the waypoint that each pose belongs to.
+    """
+
+    def __init__(self, start: FloatArray):
+        self.times, self.poses, self.closed, self.steps = [0.0], [start], [False], [0]
+
+    @property
+    def pose(self) -> FloatArray:
+        return self.poses[-1]
+
+    @property
+    def shut(self) -> bool:
+        return self.closed[-1]
+
+    def go(self, pose: FloatArray, step: int, speed: float) -> None:
+        """Go on to ``pose`` in the time between waypoints, or slower where that would take more than ``speed`` m/s."""
+        distance = float(np.linalg.norm(pose[:3, 3] - self.pose[:3, 3]))
+        self._add(pose, max(1 / EXECUTE_HZ, distance / speed), step)
+
+    def wait(self, seconds: float, shut: bool) -> None:
+        """Stay for ``seconds``, with the hand commanded ``shut`` or open from the beginning of them."""
+        self.closed[-1] = shut
+        self._add(self.pose, seconds, self.steps[-1])
+
+    def _add(self, pose: FloatArray, seconds: float, step: int) -> None:
+        self.times.append(self.times[-1] + seconds)
+        self.poses.append(pose)
+        self.closed.append(self.shut)
+        self.steps.append(step)
 
 
 def plan_poses(
@@ -123,13 +144,6 @@ def plan_poses(
     joints = np.stack([np.interp(position, np.arange(len(poses)), column) for column in path.joints.T], axis=1)
     nearest = np.ceil(position - 1e-9).clip(0).astype(int)
     return Motion(joints, _finger_ramp(closed[nearest], rate_hz), poses[nearest], closed[nearest])
-
-
-def _lead_in(home: FloatArray, first: FloatArray) -> list[FloatArray]:
-    """Poses from ``home`` over to ``first``: at the height of the higher one, then down."""
-    over = first.copy()
-    over[2, 3] = max(home[2, 3], first[2, 3])
-    return [home, over, first]
 
 
 def _smooth(times: FloatArray, knots: FloatArray, at: FloatArray) -> FloatArray:
