@@ -127,9 +127,9 @@ def load_reference(checkout: Path) -> types.ModuleType:
     source = checkout / "extractor.py"
     if not source.exists():
         raise SystemExit(f"{source} does not exist; pass a checkout of ShirAmir/dino-vit-features")
-    if importlib.util.find_spec("timm") is None:
+    if "timm" not in sys.modules and importlib.util.find_spec("timm") is None:
         sys.modules["timm"] = types.ModuleType("timm")
-    if importlib.util.find_spec("torchvision") is None:
+    if "torchvision" not in sys.modules and importlib.util.find_spec("torchvision") is None:
         stand_in, transforms = types.ModuleType("torchvision"), types.ModuleType("torchvision.transforms")
         stand_in.transforms = transforms  # type: ignore[attr-defined]
         sys.modules |= {"torchvision": stand_in, "torchvision.transforms": transforms}
