@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,8 @@ from robust_instant_policy.perception.page import keypoints_page
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 
-Camera = Callable[[Observation], Observation]
+NOISE_SEED = 1_000_000  # of the demonstrations' camera noise, apart from the scenes'
+Camera = Callable[[Observation, int], Observation]
 
 
 def show_keypoints(demos: Path, features: str, num_scenes: int, noisy: bool, seed: int, out: Path) -> Path:
@@ -27,9 +27,8 @@ def show_keypoints(demos: Path, features: str, num_scenes: int, noisy: bool, see
     """
     screen = StageConsole()
     demonstrations = load_demonstrations(demos)
-    count = itertools.count()  # every photograph has noise of its own
-    camera: Camera = (lambda seen: CameraNoise().photograph(seen, next(count))) if noisy else (lambda seen: seen)
-    images = [camera(demonstration.observation) for demonstration in demonstrations]
+    camera: Camera = CameraNoise().photograph if noisy else lambda seen, _: seen
+    images = [camera(one.observation, NOISE_SEED + index) for index, one in enumerate(demonstrations)]
     name = demonstrations[0].task
     simulated = name in TASK_NAMES and all(one.seed is not None for one in demonstrations)
     extractor = KeypointExtractor(features=features)
@@ -42,7 +41,7 @@ def show_keypoints(demos: Path, features: str, num_scenes: int, noisy: bool, see
             with screen.stage(f"keypoints of {len(images)} demonstrations"):
                 extractor.fit(images)
             with screen.stage(f"{num_scenes} new scenes"):
-                scenes, accuracy = _compare(task, extractor, demonstrations, images, camera, num_scenes, seed)
+                scenes, accuracy = _compare(task, extractor, demonstrations, camera, num_scenes, seed)
         finally:
             task.close()
         screen.say(f"    {accuracy.summary()}")
@@ -61,7 +60,6 @@ def _compare(
     task: Any,
     extractor: KeypointExtractor,
     demonstrations: list[Demonstration],
-    images: list[Observation],
     camera: Camera,
     num_scenes: int,
     seed: int,
@@ -72,6 +70,8 @@ def _compare(
         known.append(task.scene_truth())
     scenes, scenes_known = [], []
     for index in range(num_scenes):
-        scenes.append(camera(task.reset(scene_seed(seed, index))))
+        scenes.append(task.reset(scene_seed(seed, index)))
         scenes_known.append(task.scene_truth())
-    return scenes, measure(extractor, images, known, scenes, scenes_known)
+    rendered = [demonstration.observation for demonstration in demonstrations]
+    accuracy = measure(extractor, rendered, known, scenes, scenes_known, camera)
+    return [camera(scene, index) for index, scene in enumerate(scenes)], accuracy
