@@ -88,7 +88,7 @@ def test_a_damaged_plan_is_refused_in_one_line(tmp_path):
 
 def test_the_report_tells_the_whole_story_without_the_network(run_folder):
     page = write_report(run_folder).read_text()
-    assert page.count("<figure") == 4  # the new scene and three demonstrations
+    assert page.count("<figure") == 5  # the proposals, the new scene, three demonstrations
     assert "failed: it &lt;slipped&gt;" in page
     assert "a &lt;remark&gt;" in page
     assert "candidate 4 (hallucinated)" in page
