@@ -34,7 +34,7 @@ GRIP_FORCE_N = 130.0  # (Hand-E manual)
 
 ARM_TORQUE_NM = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # "Max. joint torques", Universal Robots
 DRIVE_LAG_S = 0.03
-ARM_STIFFNESS = (6e3, 6e3, 4e3, 6e2, 6e2, 4e2)  # N m / rad: a tool pressed 5 mm too deep pushes with some 30 N
+ARM_STIFFNESS = (6e3, 6e3, 4e3, 6e2, 6e2, 4e2)  # N m / rad: 5 mm into the table press with 70 to 210 N
 FINGER_STIFFNESS = 3e3  # N / m: soft enough never to saturate, so the two fingers stay centred as if geared together
 FINGER_DAMPING = 1.5e2  # N s / m
 FINGER_FRICTION = 1.2  # rubber pads on plastic or wood
