@@ -15,7 +15,7 @@ from robust_instant_policy.report import CANDIDATE_COLOURS, HALLUCINATED_COLOUR,
 
 HEIGHT = 360  # pixels
 EVERY = 2  # of the video's frames
-FRAME_MS = 145
+FRAME_MS = 145  # twice the frames' distance, as every second one is taken
 COLOURS = 256
 
 

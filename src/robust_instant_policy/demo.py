@@ -26,8 +26,6 @@ from robust_instant_policy.report import (
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.task import Task
 
-VIDEO_FPS = 20
-
 
 def run_demo(
     task_name: str, llm_spec: str, seed: int, demonstrations: str, out: Path, data: Path, options: dict[str, Any]
@@ -90,7 +88,7 @@ def _run(
     plan.save(out / PLAN_FILE)
     observation.save(out / SEEN_FILE)
     save_context(out, [one.observation.rgb for one in shown], instant.extractor.pixels_)
-    with screen.stage("execution"), VideoWriter(out / VIDEO_FILE, fps=VIDEO_FPS) as video:
+    with screen.stage("execution"), VideoWriter(out / VIDEO_FILE, fps=task.video_hz) as video:
         try:
             execution = task.execute(plan.trajectory, on_frame=video.add)
             success, failure = execution.success, execution.failure
