@@ -6,7 +6,7 @@ cd "$(dirname "$0")/.."
 
 readonly TORCH=$(grep '^torch==' constraints.txt)
 readonly TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
-readonly EXTRAS=sim,vision,embedded,train,import,dev
+readonly EXTRAS=sim,aloha,vision,embedded,train,import,distributed,dev
 readonly STAMP=.venv/setup-stamp
 
 say() { printf '\033[1m[setup]\033[0m %s\n' "$*"; }

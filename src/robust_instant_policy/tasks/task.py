@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.trajectory import Trajectory
 
 Image = NDArray[np.uint8]
@@ -29,6 +30,20 @@ class Execution:
     failure: str
     seconds: float
     tracking_error: float
+
+
+class Controller(Protocol):
+    """A policy in closed loop: it looks again while it moves."""
+
+    rate_hz: float  # of the waypoints it commands
+
+    def act(self, image: Image, action: FloatArray) -> FloatArray | None:
+        """The next waypoints ``(N, 10·A)``, N >= 1, each an action as in `Trajectory`; None once it is done.
+
+        ``image (H, W, 3)`` uint8 is what the camera of the start observation sees now, ``action (10·A,)`` where the
+        grippers are now (points in metres, world frame) with the state they were last told to take.
+        """
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +84,19 @@ class Task(Protocol):
         """
         ...
 
+    def follow(self, controller: Controller, max_seconds: float, on_frame: FrameSink | None = None) -> Execution:
+        """Let ``controller`` move the robot, from home, in the scene of the last `reset`, for ``max_seconds`` at most.
+
+        A waypoint that the arm cannot follow safely ends the episode where it is, and is its ``failure``.
+        """
+        ...
+
     def demonstrate(self, seed: int, with_images: bool = False) -> Attempt:
         """Let the demonstrator try the scene of ``seed``, in its own manner for that seed."""
+        ...
+
+    def scene_truth(self) -> SceneTruth:
+        """What the pixels of the last `reset` show: for measuring perception, never for a policy."""
         ...
 
     def close(self) -> None: ...

@@ -19,7 +19,7 @@ from mani_skill.utils.structs.types import SimConfig
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.tasks.maniskill.robot import FINGER_TRAVEL_M, UR5eHandE
-from robust_instant_policy.tasks.maniskill.scene_truth import SceneTruth
+from robust_instant_policy.tasks.scene_truth import SceneTruth
 
 RECORD_HZ = 55.0  # "recorded at 55 Hz" (Oh et al. 2025, Sec. V-A)
 SIM_HZ = 220

@@ -18,7 +18,7 @@ from robust_instant_policy.tasks.maniskill.kinematics import Kinematics
 from robust_instant_policy.tasks.maniskill.motion import EXECUTE_HZ, Motion, plan_poses, plan_waypoints
 from robust_instant_policy.tasks.maniskill.renderer import require_renderer
 from robust_instant_policy.tasks.maniskill.robot import PALM_TRIANGLE
-from robust_instant_policy.tasks.maniskill.scene_truth import SceneTruth
+from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink
 from robust_instant_policy.trajectory import Trajectory
 
