@@ -97,6 +97,14 @@ class CellEnv(BaseEnv):
         self.agent.robot.set_pose(sapien.Pose(p=BASE_POSITION_M))
         self._joints_before = self.agent.robot.get_qpos().clone()
 
+    def advance(self, command: FloatArray) -> None:
+        """One control step, with joint angles and finger travel ``(7,)`` commanded, judging nothing.
+
+        `step` evaluates the task, too, which for an object in the hand takes longer than the physics.
+        """
+        self._step_action(command)
+        self._elapsed_steps += 1
+
     def _before_control_step(self) -> None:
         self._joints_before = self.agent.robot.get_qpos().clone()
 

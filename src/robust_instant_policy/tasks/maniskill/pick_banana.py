@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ LIFTED_M = 0.05
 GRASP_HEIGHT_M = 0.007  # of the fingertips over the table
 ABOVE_M = 0.12
 LIFT_M = 0.16
+
+_skin = lru_cache(maxsize=4)(Banana.skin)  # a scene is built anew for each execution in it
 
 
 @register_env("RIP-PickBanana-v1", max_episode_steps=600)
@@ -85,7 +88,7 @@ def _build(shape: Banana, scene: Any) -> Actor:
         builder.add_capsule_collision(pose, radius, half_length, material=friction, density=DENSITY)
     skin = sapien.render.RenderMaterial()
     skin.base_color, skin.roughness, skin.specular = [1.0, 1.0, 1.0, 1.0], 0.55, 0.3
-    skin.base_color_texture = texture(shape.skin())
+    skin.base_color_texture = texture(_skin(shape))
     builder._procedural_shapes.append(sapien.render.RenderShapeTriangleMesh(*shape.mesh(), skin))
     builder.initial_pose = sapien.Pose([0, 0, shape.radius])
     return builder.build(name="banana")

@@ -128,7 +128,7 @@ class SimulatedTask:
                 images.append(self._cell.photograph().rgb)
             if on_frame is not None and step % STEPS_PER_FRAME == 0:
                 on_frame(self._cell.video_frame())
-            self._env.step(np.append(joints, fingers))
+            self._cell.advance(np.append(joints, fingers))
             reached = self._cell.tool_pose()
             missed = (pose[:3, :3] @ palm + pose[:3, 3]) - (reached[:3, :3] @ palm + reached[:3, 3])
             worst = max(worst, float(np.linalg.norm(missed)))
@@ -136,4 +136,4 @@ class SimulatedTask:
 
     def _rest(self, motion: Motion) -> None:
         for _ in range(SETTLE_STEPS):
-            self._env.step(np.append(motion.joints[-1], motion.fingers[-1]))
+            self._cell.advance(np.append(motion.joints[-1], motion.fingers[-1]))
