@@ -79,6 +79,9 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("--episodes", type=_positive, default=10)
     record.add_argument("--seed", type=_natural, default=0, help="where a new folder starts drawing scenes")
     record.add_argument("--images", action="store_true", help="keep the camera's images along the way")
+    record.add_argument(
+        "--assets", choices=("code", "maniskill"), default="code", help="built in code, or ManiSkill's downloads"
+    )
     record.add_argument("--out", type=Path, required=True, metavar="DIR")
 
     plan = command("plan", _plan, "plan for one observation and write plan.json; nothing moves")
@@ -175,7 +178,7 @@ def _record(options: argparse.Namespace) -> int:
     from robust_instant_policy.tasks.record import record
 
     screen = StageConsole()
-    task = make_task(options.task)
+    task = make_task(options.task, assets=options.assets)
     try:
         with (
             screen.stage(f"{options.episodes} demonstrations"),
