@@ -92,7 +92,7 @@ def verdict(env: CloseCabinetEnv) -> str:
     state: dict[str, Any] = env.evaluate()
     angle = np.rad2deg(float(state["angle"]))
     if angle >= np.rad2deg(CLOSED_RAD):
-        return f"the door is {angle:.0f} degrees open, {np.rad2deg(CLOSED_RAD):.0f} allowed"
+        return f"the door is {angle:.1f} degrees open, {np.rad2deg(CLOSED_RAD):.0f} allowed"
     return "" if bool(state["still"]) else "the door is shut but still moving"
 
 
