@@ -17,7 +17,7 @@ import trimesh
 
 from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.tasks import make_task
-from robust_instant_policy.tasks.maniskill.banana import Banana
+from robust_instant_policy.tasks.banana import Banana
 
 # In a process of its own, because ManiSkill reads the folder of its downloads when it is imported.
 SCRIPT = """

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robust_instant_policy.geometry import make_pose
-from robust_instant_policy.tasks.maniskill.kinematics import Kinematics
+from robust_instant_policy.tasks.maniskill.arm import ur5e_kinematics
+from robust_instant_policy.tasks.maniskill.cell import BASE_POSITION_M, HOME_JOINTS
 from robust_instant_policy.tasks.maniskill.robot import ARM_JOINTS, FINGER_JOINTS, URDF_PATH
-from robust_instant_policy.tasks.maniskill.simulated_task import BASE_POSITION_M, HOME_JOINTS
 
 # Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR5e: d, a (m), alpha (rad).
 DH = (
@@ -24,7 +24,7 @@ DH = (
     (0.0996, 0.0, 0.0),
 )
 TOOL_M = 0.157
-kinematics = Kinematics((0.0, 0.0, 0.0))
+kinematics = ur5e_kinematics((0.0, 0.0, 0.0))
 angles = st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6)
 
 
@@ -77,7 +77,7 @@ def test_simulator_and_kinematics_agree_on_the_tool():
     env = gymnasium.make("RIP-PushCube-v1", obs_mode="none")
     try:
         env.reset(seed=0)
-        at_home = Kinematics(BASE_POSITION_M).tool_pose(HOME_JOINTS)
+        at_home = ur5e_kinematics(BASE_POSITION_M).tool_pose(HOME_JOINTS)
         np.testing.assert_allclose(env.unwrapped.tool_pose(), at_home, atol=1e-5)
     finally:
         env.close()

@@ -9,13 +9,13 @@ import torch
 from mani_skill.utils.registration import register_env
 
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill import partnet
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.chest import Chest
-from robust_instant_policy.tasks.maniskill.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill.mechanism import Drawer, Mechanism
-from robust_instant_policy.tasks.maniskill.poses import downward, facing
 from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
+from robust_instant_policy.tasks.poses import downward, facing
 
 X_RANGE_M, Y_RANGE_M = (0.06, 0.14), (-0.13, 0.13)  # of the middle of the chest's front
 YAW_RANGE_RAD = np.deg2rad(20)

@@ -8,11 +8,7 @@ import numpy as np
 import sapien.render
 from numpy.typing import NDArray
 
-Color = tuple[float, float, float]
-
-GRAIN_PIXELS = 128
-GRAIN_LINES = 9  # across a face
-GRAIN_CONTRAST = 0.16
+from robust_instant_policy.tasks.textures import Color, wood
 
 
 @dataclass(frozen=True)
@@ -40,19 +36,6 @@ def texture(image: NDArray[np.uint8]) -> sapien.render.RenderTexture2D:
     """A texture from an sRGB ``image (H, W, 3)``."""
     opaque = np.full((*image.shape[:2], 1), 255, dtype=np.uint8)
     return sapien.render.RenderTexture2D(np.concatenate([image, opaque], axis=2), "R8G8B8A8Unorm", srgb=True)
-
-
-def wood(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Fibres along the image's rows, as they run in a sawn board."""
-    down = np.linspace(0.0, 1.0, GRAIN_PIXELS)[:, None]
-    along = np.linspace(0.0, 1.0, GRAIN_PIXELS)[None]
-    bend = 0.04 * np.sin(2 * np.pi * (along * rng.uniform(0.5, 1.5) + rng.random()))
-    fibres = np.zeros((GRAIN_PIXELS, GRAIN_PIXELS))
-    for octave in (1.0, 2.3, 5.1):
-        fibres += np.sin(2 * np.pi * (GRAIN_LINES * octave * (down + bend) + rng.random())) / octave
-    fibres += 0.5 * np.repeat(rng.normal(0.0, 1.0, (GRAIN_PIXELS, 1)), GRAIN_PIXELS, axis=1)
-    shade = 1.0 + GRAIN_CONTRAST * fibres / np.abs(fibres).max()
-    return (np.clip(np.array(color) * shade[..., None], 0.0, 1.0) * 255).astype(np.uint8)
 
 
 WHITE = Paint((0.93, 0.92, 0.89))

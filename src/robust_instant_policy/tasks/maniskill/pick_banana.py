@@ -16,13 +16,13 @@ from mani_skill.utils.structs.actor import Actor
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.geometry import FloatArray, invert_pose
+from robust_instant_policy.tasks.banana import Banana
+from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill import partnet
-from robust_instant_policy.tasks.maniskill.banana import Banana
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
-from robust_instant_policy.tasks.maniskill.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill.paint import texture
-from robust_instant_policy.tasks.maniskill.poses import downward, facing
 from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
+from robust_instant_policy.tasks.poses import downward, facing
 
 X_RANGE_M, Y_RANGE_M = (-0.08, 0.16), (-0.15, 0.15)
 YAW_RANGE_RAD = np.deg2rad(30)

@@ -10,10 +10,10 @@ import torch
 from mani_skill.utils.building import actors
 from mani_skill.utils.registration import register_env
 
+from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
-from robust_instant_policy.tasks.maniskill.demonstrator import Stroke
-from robust_instant_policy.tasks.maniskill.poses import downward
 from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
+from robust_instant_policy.tasks.poses import downward
 
 CUBE_HALF_SIZE_M = 0.02
 CUBE_RANGE_M = 0.1  # the cube's x and y lie within ± this

@@ -12,12 +12,11 @@ import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import RipError, UnreachableError
-from robust_instant_policy.tasks.maniskill.cell import BASE_POSITION_M, HOME_JOINTS, RECORD_HZ, WORKSPACE, CellEnv
-from robust_instant_policy.tasks.maniskill.demonstrator import Stroke, perform
-from robust_instant_policy.tasks.maniskill.kinematics import Kinematics
-from robust_instant_policy.tasks.maniskill.motion import EXECUTE_HZ, Motion, plan_poses, plan_waypoints
+from robust_instant_policy.tasks.demonstrator import Stroke, perform
+from robust_instant_policy.tasks.maniskill.arm import EXECUTE_HZ, ur5e_hande
+from robust_instant_policy.tasks.maniskill.cell import RECORD_HZ, WORKSPACE, CellEnv
 from robust_instant_policy.tasks.maniskill.renderer import require_renderer
-from robust_instant_policy.tasks.maniskill.robot import PALM_TRIANGLE
+from robust_instant_policy.tasks.motion import Motion, plan_poses, plan_waypoints
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink
 from robust_instant_policy.trajectory import Trajectory
@@ -68,7 +67,7 @@ class SimulatedTask:
         # and its like) lives on; sparing it makes a reset several times faster.
         gc.collect()
         gc.freeze()
-        self._kinematics = Kinematics(BASE_POSITION_M)
+        self._arm = ur5e_hande()
         self._seed: int | None = None
         self._fresh = False  # nothing has moved since the scene was built
 
@@ -81,7 +80,7 @@ class SimulatedTask:
             raise RipError("there is no scene to execute in; call reset(seed) first")
         if not self._fresh:
             self._rebuild(self._seed)
-        motion = plan_waypoints(trajectory, self._kinematics, HOME_JOINTS, RECORD_HZ)
+        motion = plan_waypoints(trajectory, self._arm, EXECUTE_HZ, RECORD_HZ)
         tracking_error = self._play(motion, on_frame)
         failure = self._spec.verdict(self._cell)
         return Execution(not failure, failure, len(motion.joints) / RECORD_HZ, tracking_error)
@@ -90,11 +89,10 @@ class SimulatedTask:
         observation = self.reset(seed)
         rng = np.random.default_rng([seed, HAND_STREAM])
         strokes = self._spec.expert(self._cell, rng)
-        home = self._kinematics.tool_pose(HOME_JOINTS)
-        poses, closed = perform(home, strokes, rng, RECORD_HZ)
+        poses, closed = perform(self._arm.home_pose, strokes, rng, RECORD_HZ)
         images: list[np.ndarray] = []
         try:
-            motion = plan_poses(poses, closed, self._kinematics, HOME_JOINTS, RECORD_HZ)
+            motion = plan_poses(poses, closed, self._arm, RECORD_HZ)
         except UnreachableError as error:
             failure = str(error)
         else:
@@ -102,7 +100,7 @@ class SimulatedTask:
             self._play(motion, None, images if with_images else None)
             self._rest(motion)
             failure = self._spec.verdict(self._cell)
-        trajectory = Trajectory.from_poses(poses, closed.astype(np.float64), PALM_TRIANGLE)
+        trajectory = Trajectory.from_poses(poses, closed.astype(np.float64), self._arm.triangle)
         demonstration = Demonstration(observation, trajectory, RECORD_HZ, self.name, seed)
         return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
 
@@ -120,7 +118,7 @@ class SimulatedTask:
 
     def _play(self, motion: Motion, on_frame: FrameSink | None, images: list[np.ndarray] | None = None) -> float:
         """Run the commands; the largest distance between the palm commanded and reached, in metres."""
-        palm = np.array([0.0, 0.0, -PALM_TRIANGLE.length])
+        palm = np.array([0.0, 0.0, -self._arm.triangle.length])
         self._fresh = False
         worst = 0.0
         for step, (joints, fingers, pose) in enumerate(zip(motion.joints, motion.fingers, motion.poses, strict=True)):

@@ -1,6 +1,6 @@
 """From waypoints to joint commands, with every check made before anything moves.
 
-home ──lead-in──▶ waypoint 0 ──1/5.5 s──▶ waypoint 1 ──▶ … ──▶ last ──settle──▶ judged
+home ──lead-in──▶ waypoint 0 ──1/rate──▶ waypoint 1 ──▶ … ──▶ last ──settle──▶ judged
                                  └ where the gripper state changes, the arm waits for the fingers
 """
 
@@ -9,24 +9,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
 from robust_instant_policy.errors import UnreachableError
-from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.tasks.maniskill.kinematics import Kinematics
-from robust_instant_policy.tasks.maniskill.robot import FINGER_SPEED_M_S, FINGER_TRAVEL_M, PALM_TRIANGLE
+from robust_instant_policy.geometry import FloatArray, GripperTriangle
+from robust_instant_policy.tasks.kinematics import Kinematics
 from robust_instant_policy.trajectory import Trajectory
 
-EXECUTE_HZ = 5.5  # "executed at 5.5 Hz" (Oh et al. 2025, Sec. V-A)
 LEAD_IN_SPEED_M_S = 0.35  # from home to the first waypoint
 GRIPPER_SECONDS = 0.45  # to open or close fully, with a margin
 SETTLE_SECONDS = 0.5  # at the last waypoint, before success is judged
 
-JOINT_SPEED_LIMIT_RAD_S = 0.8 * np.pi  # the joints' 180 degrees/s, with a margin for tracking
-FLIP_RAD = 0.6  # a joint change between commands 18 ms apart that only a leap across a singularity makes
-TOOL_SPEED_LIMIT_M_S = 1.0  # "typical TCP speed 1 m/s" (UR5e data sheet)
+FLIP_RAD = 0.6  # a joint change between commands 20 ms apart that only a leap across a singularity makes
 REACH_TOLERANCE_M = 5e-3
 REACH_TOLERANCE_RAD = 0.05
 TABLE_TOLERANCE_M = 0.012  # fingertips commanded deeper than this into the table are refused
@@ -35,8 +30,30 @@ CLOSED = 0.5  # gripper states above this count as closed
 
 
 @dataclass(frozen=True, eq=False)
+class Arm:
+    """What the executor has to know of an arm with a parallel gripper.
+
+    ``home (J,)`` joint angles in rad; ``finger_travel`` of each finger from closed (0) to open, in metres, and
+    ``finger_speed``, m/s; ``joint_speed`` rad/s and ``tool_speed`` m/s are limits.
+    """
+
+    kinematics: Kinematics
+    home: FloatArray
+    triangle: GripperTriangle
+    finger_travel: float
+    finger_speed: float
+    joint_speed: float
+    tool_speed: float
+
+    @property
+    def home_pose(self) -> FloatArray:
+        """Tool pose ``(4, 4)`` at home."""
+        return self.kinematics.tool_pose(self.home)
+
+
+@dataclass(frozen=True, eq=False)
 class Motion:
-    """Commands, one a control step: joint angles ``(N, 6)`` rad, finger travel ``(N,)`` m.
+    """Commands, one a control step: joint angles ``(N, J)`` rad, finger travel ``(N,)`` m.
 
     ``poses (N, 4, 4)`` and ``closed (N,)`` bool are the tool poses and gripper states meant by them.
     """
@@ -47,21 +64,21 @@ class Motion:
     closed: np.ndarray
 
 
-def plan_waypoints(trajectory: Trajectory, kinematics: Kinematics, home: ArrayLike, rate_hz: float) -> Motion:
-    """Motion from the ``home`` joints along ``trajectory``'s waypoints, with stops where the gripper acts.
+def plan_waypoints(trajectory: Trajectory, arm: Arm, execute_hz: float, rate_hz: float) -> Motion:
+    """Motion from home along ``trajectory``'s waypoints at ``execute_hz``, with stops where the gripper acts.
 
     Raises `UnreachableError` naming the first waypoint that the arm cannot or must not go to.
     """
     if trajectory.num_arms != 1:
         raise UnreachableError(f"the trajectory is for {trajectory.num_arms} arms, this cell has one")
     triplets = trajectory.triplets[:, 0]
-    waypoints = PALM_TRIANGLE.poses(triplets)
-    misfit = np.sqrt(((PALM_TRIANGLE.triplets(waypoints) - triplets) ** 2).sum(axis=-1).mean(axis=-1))
+    waypoints = arm.triangle.poses(triplets)
+    misfit = np.sqrt(((arm.triangle.triplets(waypoints) - triplets) ** 2).sum(axis=-1).mean(axis=-1))
     _refuse(misfit > TRIPLET_TOLERANCE_M, "three points that are no gripper, {:.0f} mm off its shape", misfit * 1e3)
-    depth = -PALM_TRIANGLE.triplets(waypoints)[..., 2].min(axis=-1)
+    depth = -arm.triangle.triplets(waypoints)[..., 2].min(axis=-1)
     _refuse(depth > TABLE_TOLERANCE_M, "fingers {:.0f} mm inside the table", depth * 1e3)
 
-    schedule = _Schedule(kinematics.tool_pose(home))
+    schedule = _Schedule(arm.home_pose, 1 / execute_hz)
     first = waypoints[0]
     over = first.copy()  # travel at the height of the higher one, then go down
     over[2, 3] = max(schedule.pose[2, 3], first[2, 3])
@@ -69,7 +86,7 @@ def plan_waypoints(trajectory: Trajectory, kinematics: Kinematics, home: ArrayLi
         schedule.go(pose, 0, LEAD_IN_SPEED_M_S)
     for step, (pose, shut) in enumerate(zip(waypoints, trajectory.gripper_state[:, 0] > CLOSED, strict=True)):
         if step:
-            schedule.go(pose, step, TOOL_SPEED_LIMIT_M_S / 2)  # the cubic is up to twice as fast as its mean
+            schedule.go(pose, step, arm.tool_speed / 2)  # the cubic is up to twice as fast as its mean
         if shut != schedule.shut:
             schedule.wait(GRIPPER_SECONDS, bool(shut))
     schedule.wait(SETTLE_SECONDS, schedule.shut)
@@ -80,16 +97,18 @@ def plan_waypoints(trajectory: Trajectory, kinematics: Kinematics, home: ArrayLi
     leaving = (np.searchsorted(schedule.times, at, side="right") - 1).clip(min=0)
     poses = _smooth(np.array(schedule.times), np.array(schedule.poses), at)
     closed, steps = np.array(schedule.closed)[leaving], np.array(schedule.steps)[arriving]
-    return plan_poses(poses, closed, kinematics, home, rate_hz, steps)
+    return plan_poses(poses, closed, arm, rate_hz, steps)
 
 
 class _Schedule:
     """When the tool is to be where: poses ``(4, 4)`` at increasing times, from ``start`` at time 0, hand open.
 
-    ``closed`` is the gripper command from each time on, ``steps`` the waypoint that each pose belongs to.
+    ``interval`` is the time between waypoints in seconds; ``closed`` the gripper command from each time on,
+    ``steps`` the waypoint that each pose belongs to.
     """
 
-    def __init__(self, start: FloatArray):
+    def __init__(self, start: FloatArray, interval: float):
+        self._interval = interval
         self.times, self.poses, self.closed, self.steps = [0.0], [start], [False], [0]
 
     @property
@@ -103,7 +122,7 @@ class _Schedule:
     def go(self, pose: FloatArray, step: int, speed: float) -> None:
         """Go on to ``pose`` in the time between waypoints, or slower where that would take more than ``speed`` m/s."""
         distance = float(np.linalg.norm(pose[:3, 3] - self.pose[:3, 3]))
-        self._add(pose, max(1 / EXECUTE_HZ, distance / speed), step)
+        self._add(pose, max(self._interval, distance / speed), step)
 
     def wait(self, seconds: float, shut: bool) -> None:
         """Stay for ``seconds``, with the hand commanded ``shut`` or open from the beginning of them."""
@@ -120,8 +139,7 @@ class _Schedule:
 def plan_poses(
     poses: FloatArray,
     closed: np.ndarray,
-    kinematics: Kinematics,
-    home: ArrayLike,
+    arm: Arm,
     rate_hz: float,
     steps: np.ndarray | None = None,
 ) -> Motion:
@@ -130,20 +148,20 @@ def plan_poses(
     ``closed (N,)`` is the gripper command, ``steps (N,)`` the waypoint each pose leads to, for the error messages.
     """
     steps = np.arange(len(poses)) if steps is None else steps
-    path = kinematics.follow(poses, home)
+    path = arm.kinematics.follow(poses, arm.home)
     _refuse(
         (path.position_error > REACH_TOLERANCE_M) | (path.rotation_error > REACH_TOLERANCE_RAD),
         "a pose the arm cannot reach, it stays {:.0f} mm short",
         path.position_error * 1e3,
         steps,
     )
-    change = np.abs(np.diff(path.joints, axis=0, prepend=np.asarray(home)[None])).max(axis=1)
+    change = np.abs(np.diff(path.joints, axis=0, prepend=arm.home[None])).max(axis=1)
     _refuse(change > FLIP_RAD, "an elbow or wrist that flips by {:.0f} degrees at once", np.rad2deg(change), steps)
-    count = np.maximum(np.ceil(change * rate_hz / JOINT_SPEED_LIMIT_RAD_S), 1).astype(int)
+    count = np.maximum(np.ceil(change * rate_hz / arm.joint_speed), 1).astype(int)
     position = np.repeat(np.arange(len(poses)), count) - 1 + np.concatenate([np.arange(1, n + 1) / n for n in count])
     joints = np.stack([np.interp(position, np.arange(len(poses)), column) for column in path.joints.T], axis=1)
     nearest = np.ceil(position - 1e-9).clip(0).astype(int)
-    return Motion(joints, _finger_ramp(closed[nearest], rate_hz), poses[nearest], closed[nearest])
+    return Motion(joints, _finger_ramp(closed[nearest], arm, rate_hz), poses[nearest], closed[nearest])
 
 
 def _smooth(times: FloatArray, knots: FloatArray, at: FloatArray) -> FloatArray:
@@ -154,12 +172,12 @@ def _smooth(times: FloatArray, knots: FloatArray, at: FloatArray) -> FloatArray:
     return poses
 
 
-def _finger_ramp(closed: np.ndarray, rate_hz: float) -> FloatArray:
+def _finger_ramp(closed: np.ndarray, arm: Arm, rate_hz: float) -> FloatArray:
     """Finger travel ``(N,)`` that follows the gripper command no faster than the hand can, from open."""
     fingers = np.empty(len(closed))
-    travel, most = FINGER_TRAVEL_M, FINGER_SPEED_M_S / rate_hz
+    travel, most = arm.finger_travel, arm.finger_speed / rate_hz
     for step, shut in enumerate(closed):
-        travel += np.clip((0.0 if shut else FINGER_TRAVEL_M) - travel, -most, most)
+        travel += np.clip((0.0 if shut else arm.finger_travel) - travel, -most, most)
         fingers[step] = travel
     return fingers
 

@@ -1,16 +1,16 @@
-"""Forward and inverse kinematics of the arm, by mink on the MuJoCo model of the same URDF."""
+"""Forward and inverse kinematics of an arm, by mink on its MuJoCo model."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import mink
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robust_instant_policy.geometry import FloatArray, invert_pose, make_pose
-from robust_instant_policy.tasks.maniskill.robot import ARM_JOINTS, TOOL_LINK, URDF_PATH
+from robust_instant_policy.geometry import FloatArray, invert_pose
 
 MAX_ITERATIONS = 30  # per pose; along a path two or three are enough
 CONVERGED_M = 1e-4
@@ -22,7 +22,7 @@ ORIENTATION_COST = 0.3  # metres per radian: about the hand's own length
 
 @dataclass(frozen=True, eq=False)
 class JointPath:
-    """Joint angles ``(N, 6)`` rad with what they miss: ``position_error (N,)`` m, ``rotation_error (N,)`` rad."""
+    """Joint angles ``(N, J)`` rad with what they miss: ``position_error (N,)`` m, ``rotation_error (N,)`` rad."""
 
     joints: FloatArray
     position_error: FloatArray
@@ -30,43 +30,44 @@ class JointPath:
 
 
 class Kinematics:
-    """The arm standing at ``base_position (3,)`` metres, its base unturned."""
+    """An arm whose first ``num_joints`` joints, in the order of ``model``, move the frame ``tool``.
 
-    def __init__(self, base_position: ArrayLike):
-        spec = mujoco.MjSpec.from_file(str(URDF_PATH))
-        spec.compiler.fusestatic = False  # the tool frame is a link of its own
-        self._configuration = mink.Configuration(spec.compile())
+    ``tool`` names a ``kind`` ("body" or "site") of the model; ``base (4, 4)`` is where the model's origin stands in
+    the world.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, tool: str, kind: Literal["body", "site"], num_joints: int, base: ArrayLike
+    ):
+        self._configuration = mink.Configuration(model)
+        self._tool, self._kind, self.num_joints = tool, kind, num_joints
         self._task = mink.FrameTask(
-            TOOL_LINK,
-            "body",
-            position_cost=1.0,
-            orientation_cost=ORIENTATION_COST,
-            lm_damping=LEVENBERG_MARQUARDT,
+            tool, kind, position_cost=1.0, orientation_cost=ORIENTATION_COST, lm_damping=LEVENBERG_MARQUARDT
         )
-        self._limits = [mink.ConfigurationLimit(self._configuration.model)]
-        self._base = make_pose(np.eye(3), base_position)
+        self._limits = [mink.ConfigurationLimit(model)]
+        self._base = np.asarray(base, dtype=np.float64)
 
     def tool_pose(self, joints: ArrayLike) -> FloatArray:
-        """Tool pose ``(4, 4)`` in the world at ``joints (6,)``."""
+        """Tool pose ``(4, 4)`` in the world at ``joints (J,)``."""
         self._place(joints)
-        return self._base @ self._configuration.get_transform_frame_to_world(TOOL_LINK, "body").as_matrix()
+        return self._base @ self._configuration.get_transform_frame_to_world(self._tool, self._kind).as_matrix()
 
     def follow(self, poses: ArrayLike, start: ArrayLike) -> JointPath:
         """Joint angles along tool ``poses (N, 4, 4)``, each solved from the one before, the first from ``start``."""
         poses = np.asarray(poses, dtype=np.float64)
         self._place(start)
         local = invert_pose(self._base) @ poses
-        joints = np.empty((len(poses), len(ARM_JOINTS)))
+        joints = np.empty((len(poses), self.num_joints))
         errors = np.empty((len(poses), 2))
         for step, pose in enumerate(local):
             self._task.set_target(mink.SE3.from_matrix(pose))
             errors[step] = self._solve()
-            joints[step] = self._configuration.q[: len(ARM_JOINTS)]
+            joints[step] = self._configuration.q[: self.num_joints]
         return JointPath(joints, errors[:, 0], errors[:, 1])
 
     def _place(self, joints: ArrayLike) -> None:
         q = np.zeros(self._configuration.model.nq)
-        q[: len(ARM_JOINTS)] = joints
+        q[: self.num_joints] = joints
         self._configuration.update(q)
 
     def _solve(self) -> tuple[float, float]:

@@ -1,0 +1,44 @@
+"""The UR5e with its Hand-E, as the executor sees it."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robust_instant_policy.geometry import make_pose
+from robust_instant_policy.tasks.kinematics import Kinematics
+from robust_instant_policy.tasks.maniskill.cell import BASE_POSITION_M, HOME_JOINTS
+from robust_instant_policy.tasks.maniskill.robot import (
+    ARM_JOINTS,
+    FINGER_SPEED_M_S,
+    FINGER_TRAVEL_M,
+    PALM_TRIANGLE,
+    TOOL_LINK,
+    URDF_PATH,
+)
+from robust_instant_policy.tasks.motion import Arm
+
+EXECUTE_HZ = 5.5  # "executed at 5.5 Hz" (Oh et al. 2025, Sec. V-A)
+JOINT_SPEED_LIMIT_RAD_S = 0.8 * np.pi  # the joints' 180 degrees/s, with a margin for tracking
+TOOL_SPEED_LIMIT_M_S = 1.0  # "typical TCP speed 1 m/s" (UR5e data sheet)
+
+
+def ur5e_kinematics(base_position: ArrayLike) -> Kinematics:
+    """The arm standing at ``base_position (3,)`` metres, its base unturned."""
+    spec = mujoco.MjSpec.from_file(str(URDF_PATH))
+    spec.compiler.fusestatic = False  # the tool frame is a link of its own
+    return Kinematics(spec.compile(), TOOL_LINK, "body", len(ARM_JOINTS), make_pose(np.eye(3), base_position))
+
+
+def ur5e_hande() -> Arm:
+    """The arm of the cell."""
+    return Arm(
+        kinematics=ur5e_kinematics(BASE_POSITION_M),
+        home=np.array(HOME_JOINTS),
+        triangle=PALM_TRIANGLE,
+        finger_travel=FINGER_TRAVEL_M,
+        finger_speed=FINGER_SPEED_M_S,
+        joint_speed=JOINT_SPEED_LIMIT_RAD_S,
+        tool_speed=TOOL_SPEED_LIMIT_M_S,
+    )

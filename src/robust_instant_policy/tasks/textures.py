@@ -1,0 +1,25 @@
+"""How materials look, as sRGB images."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Color = tuple[float, float, float]
+
+GRAIN_PIXELS = 128
+GRAIN_LINES = 9  # across a face
+GRAIN_CONTRAST = 0.16
+
+
+def wood(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Fibres along the image's rows, as they run in a sawn board."""
+    down = np.linspace(0.0, 1.0, GRAIN_PIXELS)[:, None]
+    along = np.linspace(0.0, 1.0, GRAIN_PIXELS)[None]
+    bend = 0.04 * np.sin(2 * np.pi * (along * rng.uniform(0.5, 1.5) + rng.random()))
+    fibres = np.zeros((GRAIN_PIXELS, GRAIN_PIXELS))
+    for octave in (1.0, 2.3, 5.1):
+        fibres += np.sin(2 * np.pi * (GRAIN_LINES * octave * (down + bend) + rng.random())) / octave
+    fibres += 0.5 * np.repeat(rng.normal(0.0, 1.0, (GRAIN_PIXELS, 1)), GRAIN_PIXELS, axis=1)
+    shade = 1.0 + GRAIN_CONTRAST * fibres / np.abs(fibres).max()
+    return (np.clip(np.array(color) * shade[..., None], 0.0, 1.0) * 255).astype(np.uint8)
