@@ -63,7 +63,7 @@ def _run(
         policy = RobustInstantPolicy(instant)
         with screen.stage("keypoints of the demonstrations"):
             policy.fit(shown)
-        for note in instant.extractor.notes_:
+        for note in instant.context.extractor.notes_:
             screen.say(f"    {note}")
         with screen.stage("a new scene"):
             observation = task.reset(scene)
@@ -87,7 +87,7 @@ def _run(
     out.mkdir(parents=True, exist_ok=True)
     plan.save(out / PLAN_FILE)
     observation.save(out / SEEN_FILE)
-    save_context(out, [one.observation.rgb for one in shown], instant.extractor.pixels_)
+    save_context(out, [one.observation.rgb for one in shown], instant.context.extractor.pixels_)
     with screen.stage("execution"), VideoWriter(out / VIDEO_FILE, fps=task.video_hz) as video:
         try:
             execution = task.execute(plan.trajectory, on_frame=video.add)

@@ -112,6 +112,7 @@ class InContextPrompt:
             self._write_sequences(list(np.round(numbers)))
         else:
             shown = np.stack([self._inputs(points) for points in self._keypoints])
+            self._numbers = numbers
             self._centre = np.round(np.median(numbers, axis=0))
             blocks = _neighbours(self.frames_, STEPS_PER_QUERY)
             questions = (_ask(steps, numbers - self._centre, shown) for steps in blocks)
@@ -183,6 +184,16 @@ class InContextPrompt:
         """
         return Trajectory.from_actions(self._decode(self._checked(keypoints), self._centre))
 
+    def carried_over(self, keypoints: FloatArray, count: int) -> tuple[Trajectory, ...]:
+        """The ``count`` demonstrations nearest to the scene of ``keypoints (K, 3)``, the nearest first, each carried
+        over to it: its numbers stay as they are in each step's frame, and the frames move with the keypoints.
+
+        What can be done without a model. Only for ``layout="factorised"``.
+        """
+        keypoints = self._checked(keypoints)
+        nearest = self._from_furthest_to_nearest(keypoints)[::-1][:count]
+        return tuple(Trajectory.from_actions(self._decode(keypoints, self._numbers[demo])) for demo in nearest)
+
     def _read(self, query_index: int, text: str) -> FloatArray | None:
         if self.layout == "factorised":
             question = self._questions[query_index]
@@ -211,11 +222,14 @@ class InContextPrompt:
 
     def _order(self, keypoints: FloatArray) -> list[int]:
         """The demonstrations in the order in which they are shown."""
-        order = list(range(len(self._keypoints)))
         if self.order == "nearest-last":
-            distances = np.linalg.norm(self._keypoints - keypoints, axis=-1).mean(axis=-1)
-            order.sort(key=lambda demo: -distances[demo])
-        return order
+            return self._from_furthest_to_nearest(keypoints)
+        return list(range(len(self._keypoints)))
+
+    def _from_furthest_to_nearest(self, keypoints: FloatArray) -> list[int]:
+        """The demonstrations by the mean distance of their keypoints from ``keypoints (K, 3)``."""
+        distances = np.linalg.norm(self._keypoints - keypoints, axis=-1).mean(axis=-1)
+        return sorted(range(len(distances)), key=lambda demo: -distances[demo])
 
     def _choose_frames(self, actions: FloatArray, key_steps: Sequence[int]) -> None:
         steps = actions.shape[1]

@@ -102,15 +102,25 @@ def run_experiment(
                 experiment.num_demonstrations,
                 partial(on_recording, task_name),
             )
-            instant = make_instant(task).fit(demonstrations)
+            instant = make_instant(task)
+            policies = {
+                method: make_policy(method, instant, experiment.num_queries).fit(demonstrations)
+                for method in dict.fromkeys(method for methods in missing.values() for method in methods)
+            }
             if experiment.objects != "seen":
                 task.close()
                 task = make_task(task_name, experiment.objects)
             for seed, methods in missing.items():
                 observation = task.reset(seed)
                 for method in methods:
-                    policy = make_policy(method, instant, experiment.num_queries)
-                    rows = roll_out(task, policy, observation, seed, experiment.num_demonstrations, experiment.objects)
+                    rows = roll_out(
+                        task,
+                        policies[method],
+                        observation,
+                        seed,
+                        experiment.num_demonstrations,
+                        experiment.objects,
+                    )
                     table.add(rows)
                     (out / "table.md").write_text(success_table(table.rows))
                     done += 1

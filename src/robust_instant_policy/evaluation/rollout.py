@@ -1,33 +1,46 @@
-"""One plan in one scene, executed."""
+"""One plan in one scene, executed; or one closed-loop policy let loose in it."""
 
 from __future__ import annotations
 
 import time
+from functools import partial
 
+import numpy as np
+from numpy.typing import NDArray
+
+from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError, PlanningError, UnreachableError
 from robust_instant_policy.evaluation.episodes import Episode
-from robust_instant_policy.policies import Policy
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.policies import ClosedLoopPolicy, Policy
 from robust_instant_policy.tasks.task import Task
 
 
 def roll_out(
-    task: Task, policy: Policy, observation: Observation, seed: int, num_demonstrations: int, objects: str = "seen"
+    task: Task,
+    policy: Policy | ClosedLoopPolicy,
+    observation: Observation,
+    seed: int,
+    num_demonstrations: int,
+    objects: str = "seen",
 ) -> list[Episode]:
     """Plan from ``observation`` and execute what the policy wants executed, each from a fresh reset to ``seed``.
 
     Methods that share an instant policy share its samples if they are given the same observation object.
     A plan that cannot be made, or that the arm refuses, is a failed episode, not an error.
     """
-    about = {"task": task.name, "objects": objects, "method": policy.name, "demos": num_demonstrations, "seed": seed}
+    row = partial(
+        Episode, task=task.name, objects=objects, method=policy.name, demos=num_demonstrations, seed=seed, candidate=0
+    )
+    if isinstance(policy, ClosedLoopPolicy):
+        return [_follow(task, policy, observation, seed, row)]
     start = time.perf_counter()
     try:
         plan = policy.plan(observation)
     except (KeypointError, PlanningError) as error:
         return [
-            Episode(
-                **about,  # type: ignore[arg-type]
-                candidate=0,
+            row(
                 success=False,
                 seconds=time.perf_counter() - start,
                 executed_seconds=0.0,
@@ -45,8 +58,7 @@ def roll_out(
         except UnreachableError as error:
             success, seconds, failure = False, 0.0, f"refused: {error}"
         episodes.append(
-            Episode(
-                **about,  # type: ignore[arg-type]
+            row(
                 candidate=index,
                 success=success,
                 seconds=plan.usage.seconds,
@@ -57,3 +69,34 @@ def roll_out(
             )
         )
     return episodes
+
+
+def _follow(
+    task: Task, policy: ClosedLoopPolicy, observation: Observation, seed: int, row: partial[Episode]
+) -> Episode:
+    controller = _Timed(policy.controller(observation))
+    task.reset(seed)
+    execution = task.follow(controller, policy.max_seconds)
+    return row(
+        success=execution.success,
+        seconds=controller.seconds,
+        executed_seconds=execution.seconds,
+        tokens=0,
+        confidence=None,
+        failure=execution.failure,
+    )
+
+
+class _Timed:
+    """A controller, and the wall ``seconds`` it has thought so far."""
+
+    def __init__(self, controller: Controller):
+        self._controller = controller
+        self.rate_hz = controller.rate_hz
+        self.seconds = 0.0
+
+    def act(self, image: NDArray[np.uint8], action: FloatArray) -> FloatArray | None:
+        start = time.perf_counter()
+        waypoints = self._controller.act(image, action)
+        self.seconds += time.perf_counter() - start
+        return waypoints

@@ -3,13 +3,18 @@
 from robust_instant_policy.policies.catalogue import METHOD_NAMES, make_policy
 from robust_instant_policy.policies.instant import InstantPolicy, Proposal
 from robust_instant_policy.policies.kat import KeypointActionTokens
-from robust_instant_policy.policies.policy import Plan, Policy, Progress, Stage, Usage
+from robust_instant_policy.policies.keypoint_context import KeypointContext
+from robust_instant_policy.policies.neighbours import Neighbours
+from robust_instant_policy.policies.policy import ClosedLoopPolicy, Plan, Policy, Progress, Stage, Usage
 from robust_instant_policy.policies.rip import RobustInstantPolicy
 
 __all__ = [
     "METHOD_NAMES",
+    "ClosedLoopPolicy",
     "InstantPolicy",
     "KeypointActionTokens",
+    "KeypointContext",
+    "Neighbours",
     "Plan",
     "Policy",
     "Progress",

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 from robust_instant_policy.context.prompt import Frames, InContextPrompt, Layout
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import DatasetError, PlanningError, UsageError
+from robust_instant_policy.errors import PlanningError, UsageError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.llm import LanguageModel
-from robust_instant_policy.perception import KeypointExtractor, Located
-from robust_instant_policy.policies.policy import Progress, Stage, Stopwatch, Usage, no_progress
+from robust_instant_policy.perception import Located
+from robust_instant_policy.policies.keypoint_context import KeypointContext
+from robust_instant_policy.policies.policy import Progress, Stage, Usage, no_progress
 from robust_instant_policy.query import Answer, Query
-from robust_instant_policy.trajectory import TARGET_STEPS, Trajectory, downsample
+from robust_instant_policy.trajectory import TARGET_STEPS, Trajectory
 
 MIN_VALID_ANSWERS = 3  # below this nobody can say which one is hallucinated
 DEADLINE_S = 300.0  # wall time of all the sampling for one plan; a busy laptop may need minutes
@@ -60,26 +61,29 @@ class InstantPolicy:
         progress: Progress = no_progress,
     ):
         self.llm = llm
-        self.downsampling, self.num_steps = downsampling, num_steps
         self.temperature, self.deadline_s, self.seed = temperature, deadline_s, seed
         self.progress = progress
-        self.extractor = KeypointExtractor(
-            num_keypoints=num_keypoints, features=features, workspace=workspace, seed=seed
+        self.context = KeypointContext(
+            num_keypoints=num_keypoints,
+            features=features,
+            downsampling=downsampling,
+            num_steps=num_steps,
+            workspace=workspace,
+            seed=seed,
+            progress=progress,
         )
         self.prompt = InContextPrompt(frames=frames, layout=layout)
         self._heard: _Heard | None = None
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> InstantPolicy:
-        """Find the common keypoints of ``demonstrations`` and write them down as context; returns itself."""
-        if not demonstrations:
-            raise DatasetError("no demonstrations; show the task at least once (rip record)")
-        self._heard = None
-        self.progress("keypoints", 0, 0)
-        self.extractor.fit([demonstration.observation for demonstration in demonstrations])
-        self.context_ = tuple(
-            downsample(demonstration.trajectory, self.downsampling, self.num_steps) for demonstration in demonstrations
-        )
-        self.prompt.fit(self.extractor.keypoints_, list(self.context_))
+        """Find the common keypoints of ``demonstrations`` and write them down as context; returns itself.
+
+        The very same demonstrations once more cost nothing.
+        """
+        if not self.context.fitted_to(demonstrations):
+            self._heard = None
+            self.context.fit(demonstrations)
+            self.prompt.fit(self.context.keypoints_, self.context.trajectories_)
         return self
 
     def propose(self, observation: Observation, num_queries: int) -> Proposal:
@@ -89,18 +93,13 @@ class InstantPolicy:
         Raises `KeypointError` where the scene cannot be recognised and `PlanningError` where fewer than
         three answers (or ``num_queries``, if fewer were wanted) are usable.
         """
-        if not hasattr(self, "context_"):
-            raise UsageError("call fit(demonstrations) before asking for a plan")
         if num_queries < 1:
             raise UsageError(f"the number of queries must be at least 1, got {num_queries}")
         heard = self._heard if self._heard is not None and self._heard.observation is observation else None
         if heard is None:
-            watch = Stopwatch()
-            self.progress("keypoints", 0, 0)
-            with watch.stage("keypoints"):
-                located = self.extractor.locate(observation)
+            located, locating = self.context.locate(observation)
             queries = self.prompt.queries(located.keypoints)
-            heard = self._heard = _Heard(observation, located, watch.stages[0], queries, [[] for _ in queries])
+            heard = self._heard = _Heard(observation, located, locating, queries, [[] for _ in queries])
         self._ask(heard, num_queries)
         answers = [of_query[:num_queries] for of_query in heard.answers]
         # Where the demonstrations agree on every number there is nothing to ask, and every candidate is the same.
@@ -111,7 +110,7 @@ class InstantPolicy:
             self.prompt.trajectory([of_query[index].text for of_query in answers], heard.located.keypoints)
             for index in range(count)
         )
-        notes = (*self.extractor.notes_, *heard.located.notes)
+        notes = (*self.context.extractor.notes_, *heard.located.notes)
         if count < num_queries:
             notes = (*notes, f"{count} of {num_queries} answers were usable in time")
         return Proposal(heard.located, candidates, Usage((heard.locating, _sampling(heard, answers))), notes)

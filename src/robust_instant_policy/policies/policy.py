@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.geometry import FloatArray
@@ -167,4 +168,24 @@ class Policy(Protocol):
 
     def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
         """The trajectories that an evaluation executes for ``plan``, one after the other."""
+        ...
+
+
+@runtime_checkable
+class ClosedLoopPolicy(Protocol):
+    """Sees demonstrations once, then moves the robot itself, looking again as it goes."""
+
+    name: str
+
+    @property
+    def max_seconds(self) -> float:
+        """How long one episode may take; known once demonstrations were seen."""
+        ...
+
+    def fit(self, demonstrations: Sequence[Demonstration]) -> ClosedLoopPolicy:
+        """Take in the demonstrations; returns itself."""
+        ...
+
+    def controller(self, observation: Observation) -> Controller:
+        """What moves the robot in the scene of ``observation``, from its start; good for one episode."""
         ...

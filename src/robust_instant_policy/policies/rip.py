@@ -59,23 +59,28 @@ class RobustInstantPolicy(KeypointActionTokens):
 
     def aggregate(self, proposal: Proposal) -> Plan:
         """The plan for candidates that were sampled before (Oh et al. 2025, Eq. 4)."""
-        watch = Stopwatch()
-        with watch.stage("regression"):
-            robust = robust_gripper_trajectory(
-                [candidate.actions for candidate in proposal.candidates],
-                times=[candidate.times for candidate in proposal.candidates],
-                dof=self.dof,
-                estimator=self.estimator,
-                seed=self.instant.seed,
-            )
-        return replace(
-            plan_of_first_candidate(proposal),
-            trajectory=Trajectory(robust.actions, robust.times),
-            weights=robust.weights,
-            scale=robust.scale,
-            hallucinated=robust.hallucinated,
-            onset=robust.onset,
-            scores=robust.scores,
-            confidence=robust.confidence,
-            usage=Usage((*proposal.usage.stages, *watch.stages)),
+        return robust_plan(proposal, self.dof, self.estimator, self.instant.seed)
+
+
+def robust_plan(proposal: Proposal, dof: float = DOF, estimator: str = "em", seed: int = 0) -> Plan:
+    """The `Plan` that follows what the candidates agree on (Oh et al. 2025, Eq. 4)."""
+    watch = Stopwatch()
+    with watch.stage("regression"):
+        robust = robust_gripper_trajectory(
+            [candidate.actions for candidate in proposal.candidates],
+            times=[candidate.times for candidate in proposal.candidates],
+            dof=dof,
+            estimator=estimator,
+            seed=seed,
         )
+    return replace(
+        plan_of_first_candidate(proposal),
+        trajectory=Trajectory(robust.actions, robust.times),
+        weights=robust.weights,
+        scale=robust.scale,
+        hallucinated=robust.hallucinated,
+        onset=robust.onset,
+        scores=robust.scores,
+        confidence=robust.confidence,
+        usage=Usage((*proposal.usage.stages, *watch.stages)),
+    )

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.scene_truth import SceneTruth
@@ -30,20 +31,6 @@ class Execution:
     failure: str
     seconds: float
     tracking_error: float
-
-
-class Controller(Protocol):
-    """A policy in closed loop: it looks again while it moves."""
-
-    rate_hz: float  # of the waypoints it commands
-
-    def act(self, image: Image, action: FloatArray) -> FloatArray | None:
-        """The next waypoints ``(N, 10·A)``, N >= 1, each an action as in `Trajectory`; None once it is done.
-
-        ``image (H, W, 3)`` uint8 is what the camera of the start observation sees now, ``action (10·A,)`` where the
-        grippers are now (points in metres, world frame) with the state they were last told to take.
-        """
-        ...
 
 
 @dataclass(frozen=True, eq=False)
