@@ -5,12 +5,30 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib import import_module
 
 from robust_instant_policy.errors import MissingExtraError, UnknownNameError
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image, Task
 
-TASK_NAMES = ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")
+
+@dataclass(frozen=True)
+class Family:
+    """Tasks that share a simulator: their ``names``, which after ``prefix`` name the modules of a ``package``."""
+
+    package: str
+    extra: str
+    prefix: str
+    names: tuple[str, ...]
+
+    def module_of(self, name: str) -> str:
+        return name.removeprefix(self.prefix).replace("-", "_")
+
+
+FAMILIES = (
+    Family("maniskill", "sim", "", ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")),
+)
+TASK_NAMES = tuple(name for family in FAMILIES for name in family.names)
 
 
 def make_task(name: str, objects: str = "seen", assets: str = "code") -> Task:
@@ -24,18 +42,20 @@ def make_task(name: str, objects: str = "seen", assets: str = "code") -> Task:
     """
     if name not in TASK_NAMES:
         raise UnknownNameError("task", name, TASK_NAMES)
+    family = next(family for family in FAMILIES if name in family.names)
     try:
-        simulated = import_module("robust_instant_policy.tasks.maniskill.simulated_task")
-        module = import_module(f"robust_instant_policy.tasks.maniskill.{name.replace('-', '_')}")
+        package = f"robust_instant_policy.tasks.{family.package}"
+        make = import_module(f"{package}.task").CellTask
+        module = import_module(f"{package}.{family.module_of(name)}")
     except ModuleNotFoundError as error:
         if error.name and error.name.startswith("robust_instant_policy"):
             raise
-        raise MissingExtraError(error.name or "mani_skill", "sim") from error
+        raise MissingExtraError(error.name or family.extra, family.extra) from error
     if objects not in module.SPEC.object_sets:
         raise UnknownNameError(f"set of objects of {name}", objects, module.SPEC.object_sets)
     if assets not in module.SPEC.asset_sources:
         raise UnknownNameError(f"source of assets of {name}", assets, module.SPEC.asset_sources)
-    task: Task = simulated.SimulatedTask(module.SPEC, objects, assets)
+    task: Task = make(module.SPEC, objects, assets)
     return task
 
 

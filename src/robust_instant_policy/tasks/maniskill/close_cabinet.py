@@ -14,9 +14,9 @@ from robust_instant_policy.tasks.maniskill import partnet
 from robust_instant_policy.tasks.maniskill.cabinet import Cabinet
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.mechanism import Door, Mechanism
-from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
 from robust_instant_policy.tasks.object_sets import draw_object
 from robust_instant_policy.tasks.poses import downward, facing
+from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (0.08, 0.16), (-0.12, 0.06)  # of the middle of the cabinet's front, hinge on the +y side
 YAW_RANGE_RAD = np.deg2rad(20)
@@ -104,4 +104,5 @@ SPEC = TaskSpec(
     expert=shut,
     verdict=verdict,
     object_sets=("seen", "unseen"),
+    asset_sources=("code", "maniskill"),
 )

@@ -14,8 +14,8 @@ from robust_instant_policy.tasks.maniskill import partnet
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.chest import Chest
 from robust_instant_policy.tasks.maniskill.mechanism import Drawer, Mechanism
-from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
 from robust_instant_policy.tasks.poses import downward, facing
+from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (0.06, 0.14), (-0.13, 0.13)  # of the middle of the chest's front
 YAW_RANGE_RAD = np.deg2rad(20)
@@ -87,4 +87,5 @@ SPEC = TaskSpec(
     env_id="RIP-OpenDrawer-v1",
     expert=pull,
     verdict=verdict,
+    asset_sources=("code", "maniskill"),
 )

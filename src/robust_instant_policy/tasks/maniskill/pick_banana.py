@@ -21,8 +21,8 @@ from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill import partnet
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.paint import texture
-from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
 from robust_instant_policy.tasks.poses import downward, facing
+from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.08, 0.16), (-0.15, 0.15)
 YAW_RANGE_RAD = np.deg2rad(30)
@@ -124,4 +124,5 @@ SPEC = TaskSpec(
     env_id="RIP-PickBanana-v1",
     expert=pick,
     verdict=verdict,
+    asset_sources=("code", "maniskill"),
 )

@@ -12,8 +12,8 @@ from mani_skill.utils.registration import register_env
 
 from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
-from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
 from robust_instant_policy.tasks.poses import downward
+from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 CUBE_HALF_SIZE_M = 0.02
 CUBE_RANGE_M = 0.1  # the cube's x and y lie within ± this
@@ -97,5 +97,4 @@ SPEC = TaskSpec(
     env_id="RIP-PushCube-v1",
     expert=push,
     verdict=verdict,
-    asset_sources=("code",),
 )

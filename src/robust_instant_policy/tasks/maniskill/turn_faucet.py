@@ -14,9 +14,9 @@ from robust_instant_policy.tasks.maniskill import partnet
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.faucet import Faucet
 from robust_instant_policy.tasks.maniskill.mechanism import Lever, Mechanism
-from robust_instant_policy.tasks.maniskill.simulated_task import TaskSpec
 from robust_instant_policy.tasks.object_sets import draw_object
 from robust_instant_policy.tasks.poses import downward, facing
+from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.02, 0.16), (-0.14, 0.10)
 YAW_RANGE_RAD = np.deg2rad(30)
@@ -101,4 +101,5 @@ SPEC = TaskSpec(
     expert=turn,
     verdict=verdict,
     object_sets=("seen", "unseen"),
+    asset_sources=("code", "maniskill"),
 )

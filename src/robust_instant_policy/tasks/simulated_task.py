@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
-import gymnasium
 import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import RipError, UnreachableError
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.demonstrator import Stroke, perform
-from robust_instant_policy.tasks.maniskill.arm import EXECUTE_HZ, ur5e_hande
-from robust_instant_policy.tasks.maniskill.cell import RECORD_HZ, WORKSPACE, CellEnv
-from robust_instant_policy.tasks.maniskill.renderer import require_renderer
-from robust_instant_policy.tasks.motion import Motion, plan_poses, plan_waypoints
+from robust_instant_policy.tasks.motion import Arm, Motion, plan_poses, plan_waypoints
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink
 from robust_instant_policy.trajectory import Trajectory
 
 HAND_STREAM = 1  # the demonstrator's random numbers, apart from the scene's
-SETTLE_STEPS = 27  # half a second at rest before a demonstration is judged
-STEPS_PER_FRAME = 4
-VIDEO_HZ = RECORD_HZ / STEPS_PER_FRAME
+SETTLE_SECONDS = 0.5  # at rest before a demonstration is judged
 
 Expert = Callable[[Any, np.random.Generator], Sequence[Stroke]]
 Verdict = Callable[[Any], str]
@@ -46,28 +40,48 @@ class TaskSpec:
     expert: Expert
     verdict: Verdict
     object_sets: tuple[str, ...] = ("seen",)
-    asset_sources: tuple[str, ...] = ("code", "maniskill")
+    asset_sources: tuple[str, ...] = ("code",)
+
+
+class Cell(Protocol):
+    """A gymnasium environment that holds a scene with an arm; see the methods of the same names in `Task`.
+
+    ``advance`` takes one control step towards ``command``, joint angles and finger travel ``(J + 1,)``, rad and m.
+    ``tool_pose`` is where the arm's tool frame is, ``(4, 4)``.
+    """
+
+    def reset(self, *, seed: int) -> Any: ...
+    def photograph(self) -> Observation: ...
+    def scene_truth(self) -> SceneTruth: ...
+    def advance(self, command: FloatArray) -> None: ...
+    def tool_pose(self) -> FloatArray: ...
+    def video_frame(self) -> np.ndarray: ...
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Control steps a second, of which every ``record_every``-th is recorded and every ``frame_every``-th filmed.
+
+    ``execute_hz`` is the rate of the waypoints played back.
+    """
+
+    control_hz: float
+    record_every: int
+    frame_every: int
+    execute_hz: float
 
 
 class SimulatedTask:
-    """See `tasks.task.Task`. One scene at a time; scenes are rebuilt only where their objects differ."""
+    """See `tasks.task.Task`. One scene at a time, built anew from its seed before every execution."""
 
-    record_hz = RECORD_HZ
-    execute_hz = EXECUTE_HZ
-    video_hz = VIDEO_HZ
-    workspace = WORKSPACE
-
-    def __init__(self, spec: TaskSpec, objects: str, assets: str):
-        require_renderer()
+    def __init__(self, spec: TaskSpec, cell: Cell, arm: Arm, timing: Timing, workspace: FloatArray):
         self.name, self.description, self.goal = spec.name, spec.description, spec.goal
-        self._spec = spec
-        self._env = gymnasium.make(spec.env_id, obs_mode="none", reward_mode="none", objects=objects, assets=assets)
-        self._cell: CellEnv = self._env.unwrapped
-        # The simulator searches the whole process for garbage whenever it rebuilds a scene. What lives by now (torch
-        # and its like) lives on; sparing it makes a reset several times faster.
-        gc.collect()
-        gc.freeze()
-        self._arm = ur5e_hande()
+        self.record_hz = timing.control_hz / timing.record_every
+        self.execute_hz = timing.execute_hz
+        self.video_hz = timing.control_hz / timing.frame_every
+        self.workspace = workspace
+        self._spec, self._cell, self._arm, self._timing = spec, cell, arm, timing
         self._seed: int | None = None
         self._fresh = False  # nothing has moved since the scene was built
 
@@ -80,19 +94,20 @@ class SimulatedTask:
             raise RipError("there is no scene to execute in; call reset(seed) first")
         if not self._fresh:
             self._rebuild(self._seed)
-        motion = plan_waypoints(trajectory, self._arm, EXECUTE_HZ, RECORD_HZ)
+        control_hz = self._timing.control_hz
+        motion = plan_waypoints(trajectory, self._arm, self.execute_hz, control_hz)
         tracking_error = self._play(motion, on_frame)
         failure = self._spec.verdict(self._cell)
-        return Execution(not failure, failure, len(motion.joints) / RECORD_HZ, tracking_error)
+        return Execution(not failure, failure, len(motion.joints) / control_hz, tracking_error)
 
     def demonstrate(self, seed: int, with_images: bool = False) -> Attempt:
         observation = self.reset(seed)
         rng = np.random.default_rng([seed, HAND_STREAM])
         strokes = self._spec.expert(self._cell, rng)
-        poses, closed = perform(self._arm.home_pose, strokes, rng, RECORD_HZ)
+        poses, closed = perform(self._arm.home_pose, strokes, rng, self._timing.control_hz)
         images: list[np.ndarray] = []
         try:
-            motion = plan_poses(poses, closed, self._arm, RECORD_HZ)
+            motion = plan_poses(poses, closed, self._arm, self._timing.control_hz)
         except UnreachableError as error:
             failure = str(error)
         else:
@@ -100,21 +115,21 @@ class SimulatedTask:
             self._play(motion, None, images if with_images else None)
             self._rest(motion)
             failure = self._spec.verdict(self._cell)
-        trajectory = Trajectory.from_poses(poses, closed.astype(np.float64), self._arm.triangle)
-        demonstration = Demonstration(observation, trajectory, RECORD_HZ, self.name, seed)
+        recorded = slice(None, None, self._timing.record_every)
+        trajectory = Trajectory.from_poses(poses[recorded], closed[recorded].astype(np.float64), self._arm.triangle)
+        demonstration = Demonstration(observation, trajectory, self.record_hz, self.name, seed)
         return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
 
     def scene_truth(self) -> SceneTruth:
         """What the camera's pixels show: for measuring perception, never for a policy."""
         return self._cell.scene_truth()
 
-    def _rebuild(self, seed: int) -> None:
-        self._env.reset(seed=seed)
-        self._seed, self._fresh = seed, True
-
     def close(self) -> None:
-        self._env.close()
-        gc.unfreeze()
+        self._cell.close()
+
+    def _rebuild(self, seed: int) -> None:
+        self._cell.reset(seed=seed)
+        self._seed, self._fresh = seed, True
 
     def _play(self, motion: Motion, on_frame: FrameSink | None, images: list[np.ndarray] | None = None) -> float:
         """Run the commands; the largest distance between the palm commanded and reached, in metres."""
@@ -122,9 +137,9 @@ class SimulatedTask:
         self._fresh = False
         worst = 0.0
         for step, (joints, fingers, pose) in enumerate(zip(motion.joints, motion.fingers, motion.poses, strict=True)):
-            if images is not None:
+            if images is not None and step % self._timing.record_every == 0:
                 images.append(self._cell.photograph().rgb)
-            if on_frame is not None and step % STEPS_PER_FRAME == 0:
+            if on_frame is not None and step % self._timing.frame_every == 0:
                 on_frame(self._cell.video_frame())
             self._cell.advance(np.append(joints, fingers))
             reached = self._cell.tool_pose()
@@ -133,5 +148,5 @@ class SimulatedTask:
         return worst
 
     def _rest(self, motion: Motion) -> None:
-        for _ in range(SETTLE_STEPS):
+        for _ in range(int(SETTLE_SECONDS * self._timing.control_hz)):
             self._cell.advance(np.append(motion.joints[-1], motion.fingers[-1]))

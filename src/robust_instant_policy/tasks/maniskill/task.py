@@ -1,0 +1,31 @@
+"""The five tasks of the ManiSkill cell, behind the contract of `tasks.task.Task`."""
+
+from __future__ import annotations
+
+import gc
+
+import gymnasium
+
+from robust_instant_policy.tasks.maniskill.arm import EXECUTE_HZ, ur5e_hande
+from robust_instant_policy.tasks.maniskill.cell import RECORD_HZ, WORKSPACE
+from robust_instant_policy.tasks.maniskill.renderer import require_renderer
+from robust_instant_policy.tasks.simulated_task import SimulatedTask, TaskSpec, Timing
+
+TIMING = Timing(control_hz=RECORD_HZ, record_every=1, frame_every=4, execute_hz=EXECUTE_HZ)
+
+
+class CellTask(SimulatedTask):
+    """A task in the cell with the UR5e; ``objects`` and ``assets`` as in `tasks.make_task`."""
+
+    def __init__(self, spec: TaskSpec, objects: str, assets: str):
+        require_renderer()
+        env = gymnasium.make(spec.env_id, obs_mode="none", reward_mode="none", objects=objects, assets=assets)
+        super().__init__(spec, env.unwrapped, ur5e_hande(), TIMING, WORKSPACE)
+        # The simulator searches the whole process for garbage whenever it rebuilds a scene. What lives by now (torch
+        # and its like) lives on; sparing it makes a reset several times faster.
+        gc.collect()
+        gc.freeze()
+
+    def close(self) -> None:
+        super().close()
+        gc.unfreeze()
