@@ -80,6 +80,9 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("--seed", type=_natural, default=0, help="where a new folder starts drawing scenes")
     record.add_argument("--images", action="store_true", help="keep the camera's images along the way")
     record.add_argument(
+        "--every", type=_positive, default=1, metavar="N", help="keep every N-th step only: 5 of 55 Hz leaves 11 Hz"
+    )
+    record.add_argument(
         "--assets", choices=("code", "maniskill"), default="code", help="built in code, or ManiSkill's downloads"
     )
     record.add_argument("--out", type=Path, required=True, metavar="DIR")
@@ -182,7 +185,9 @@ def _record(options: argparse.Namespace) -> int:
     try:
         with (
             screen.stage(f"{options.episodes} demonstrations"),
-            DatasetWriter(options.out, task=task.name, description=task.description, rate_hz=task.record_hz) as writer,
+            DatasetWriter(
+                options.out, task=task.name, description=task.description, rate_hz=task.record_hz / options.every
+            ) as writer,
         ):
             thrown_away = record(
                 task,
@@ -190,6 +195,7 @@ def _record(options: argparse.Namespace) -> int:
                 options.episodes,
                 seed=options.seed,
                 with_images=options.images,
+                every=options.every,
                 on_progress=lambda there, count, _: screen.done_so_far("recording", there, count),
             )
     finally:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -63,21 +64,18 @@ class Motion:
     poses: FloatArray
     closed: np.ndarray
 
+    @classmethod
+    def at_home(cls, arm: Arm) -> Motion:
+        """One step of standing still at home, hand open."""
+        return cls(arm.home[None], np.array([arm.finger_travel]), arm.home_pose[None], np.zeros(1, dtype=bool))
+
 
 def plan_waypoints(trajectory: Trajectory, arm: Arm, execute_hz: float, rate_hz: float) -> Motion:
     """Motion from home along ``trajectory``'s waypoints at ``execute_hz``, with stops where the gripper acts.
 
     Raises `UnreachableError` naming the first waypoint that the arm cannot or must not go to.
     """
-    if trajectory.num_arms != 1:
-        raise UnreachableError(f"the trajectory is for {trajectory.num_arms} arms, this cell has one")
-    triplets = trajectory.triplets[:, 0]
-    waypoints = arm.triangle.poses(triplets)
-    misfit = np.sqrt(((arm.triangle.triplets(waypoints) - triplets) ** 2).sum(axis=-1).mean(axis=-1))
-    _refuse(misfit > TRIPLET_TOLERANCE_M, "three points that are no gripper, {:.0f} mm off its shape", misfit * 1e3)
-    depth = -arm.triangle.triplets(waypoints)[..., 2].min(axis=-1)
-    _refuse(depth > TABLE_TOLERANCE_M, "fingers {:.0f} mm inside the table", depth * 1e3)
-
+    waypoints = _tool_poses(trajectory, arm)
     schedule = _Schedule(arm.home_pose, 1 / execute_hz)
     first = waypoints[0]
     over = first.copy()  # travel at the height of the higher one, then go down
@@ -98,6 +96,36 @@ def plan_waypoints(trajectory: Trajectory, arm: Arm, execute_hz: float, rate_hz:
     poses = _smooth(np.array(schedule.times), np.array(schedule.poses), at)
     closed, steps = np.array(schedule.closed)[leaving], np.array(schedule.steps)[arriving]
     return plan_poses(poses, closed, arm, rate_hz, steps)
+
+
+def plan_onward(waypoints: ArrayLike, waypoint_hz: float, before: Motion, arm: Arm, rate_hz: float) -> Motion:
+    """Motion from the end of the one ``before`` through ``waypoints (N, 10)``, one every ``1 / waypoint_hz`` seconds.
+
+    Legs longer than the tool may go in that time take longer; nobody waits for the fingers.
+    Raises `UnreachableError` like `plan_waypoints`.
+    """
+    trajectory = Trajectory.from_actions(waypoints)
+    knots = np.concatenate([before.poses[-1:], _tool_poses(trajectory, arm)])
+    distance = np.linalg.norm(np.diff(knots[:, :3, 3], axis=0), axis=1)
+    seconds = np.maximum(1 / waypoint_hz, distance / (arm.tool_speed / 2))
+    ends = np.cumsum(np.maximum(np.round(seconds * rate_hz), 1)).astype(int)
+    at = np.arange(1, ends[-1] + 1)
+    steps = np.searchsorted(ends, at)
+    closed = trajectory.gripper_state[steps, 0] > CLOSED
+    return plan_poses(_smooth(np.append(0, ends), knots, at), closed, arm, rate_hz, steps, before)
+
+
+def _tool_poses(trajectory: Trajectory, arm: Arm) -> FloatArray:
+    """Tool poses ``(T, 4, 4)``, known to be those of a gripper above the table."""
+    if trajectory.num_arms != 1:
+        raise UnreachableError(f"the trajectory is for {trajectory.num_arms} arms, this cell has one")
+    triplets = trajectory.triplets[:, 0]
+    poses = arm.triangle.poses(triplets)
+    misfit = np.sqrt(((arm.triangle.triplets(poses) - triplets) ** 2).sum(axis=-1).mean(axis=-1))
+    _refuse(misfit > TRIPLET_TOLERANCE_M, "three points that are no gripper, {:.0f} mm off its shape", misfit * 1e3)
+    depth = -arm.triangle.triplets(poses)[..., 2].min(axis=-1)
+    _refuse(depth > TABLE_TOLERANCE_M, "fingers {:.0f} mm inside the table", depth * 1e3)
+    return poses
 
 
 class _Schedule:
@@ -142,26 +170,31 @@ def plan_poses(
     arm: Arm,
     rate_hz: float,
     steps: np.ndarray | None = None,
+    before: Motion | None = None,
 ) -> Motion:
     """Motion through tool ``poses (N, 4, 4)`` at ``rate_hz``, slowed down where a joint would be too fast.
 
     ``closed (N,)`` is the gripper command, ``steps (N,)`` the waypoint each pose leads to, for the error messages.
+    It starts where the motion ``before`` ends, or at home.
     """
+    before = Motion.at_home(arm) if before is None else before
     steps = np.arange(len(poses)) if steps is None else steps
-    path = arm.kinematics.follow(poses, arm.home)
+    path = arm.kinematics.follow(poses, before.joints[-1])
     _refuse(
         (path.position_error > REACH_TOLERANCE_M) | (path.rotation_error > REACH_TOLERANCE_RAD),
         "a pose the arm cannot reach, it stays {:.0f} mm short",
         path.position_error * 1e3,
         steps,
     )
-    change = np.abs(np.diff(path.joints, axis=0, prepend=arm.home[None])).max(axis=1)
+    change = np.abs(np.diff(path.joints, axis=0, prepend=before.joints[-1:])).max(axis=1)
     _refuse(change > FLIP_RAD, "an elbow or wrist that flips by {:.0f} degrees at once", np.rad2deg(change), steps)
     count = np.maximum(np.ceil(change * rate_hz / arm.joint_speed), 1).astype(int)
     position = np.repeat(np.arange(len(poses)), count) - 1 + np.concatenate([np.arange(1, n + 1) / n for n in count])
     joints = np.stack([np.interp(position, np.arange(len(poses)), column) for column in path.joints.T], axis=1)
     nearest = np.ceil(position - 1e-9).clip(0).astype(int)
-    return Motion(joints, _finger_ramp(closed[nearest], arm, rate_hz), poses[nearest], closed[nearest])
+    return Motion(
+        joints, _finger_ramp(closed[nearest], float(before.fingers[-1]), arm, rate_hz), poses[nearest], closed[nearest]
+    )
 
 
 def _smooth(times: FloatArray, knots: FloatArray, at: FloatArray) -> FloatArray:
@@ -172,10 +205,10 @@ def _smooth(times: FloatArray, knots: FloatArray, at: FloatArray) -> FloatArray:
     return poses
 
 
-def _finger_ramp(closed: np.ndarray, arm: Arm, rate_hz: float) -> FloatArray:
-    """Finger travel ``(N,)`` that follows the gripper command no faster than the hand can, from open."""
+def _finger_ramp(closed: np.ndarray, travel: float, arm: Arm, rate_hz: float) -> FloatArray:
+    """Finger travel ``(N,)`` that follows the gripper command from ``travel`` on, no faster than the hand can."""
     fingers = np.empty(len(closed))
-    travel, most = arm.finger_travel, arm.finger_speed / rate_hz
+    most = arm.finger_speed / rate_hz
     for step, shut in enumerate(closed):
         travel += np.clip((0.0 if shut else arm.finger_travel) - travel, -most, most)
         fingers[step] = travel

@@ -40,10 +40,12 @@ def record(
     num_episodes: int,
     seed: int = 0,
     with_images: bool = False,
+    every: int = 1,
     on_progress: Progress | None = None,
 ) -> int:
     """Record until ``writer`` holds ``num_episodes``, trying the scenes ``seed``, ``seed + 1``, … in turn.
 
+    ``with_images`` and ``every`` as in `Task.demonstrate`; the writer's rate is that of the steps that are kept.
     Goes on behind the last seed that the writer knows, so a recording that was cut off ends up with the same
     episodes as one that was not. After every attempt ``on_progress`` receives (episodes there, episodes wanted,
     attempts thrown away). Returns how many attempts were thrown away.
@@ -52,7 +54,7 @@ def record(
         seed = max(seed, writer.last_seed + 1)
     in_a_row = 0
     while writer.num_episodes < num_episodes:
-        attempt = task.demonstrate(seed, with_images)
+        attempt = task.demonstrate(seed, with_images, every)
         if attempt.success:
             writer.add(attempt.demonstration, attempt.images)
             in_a_row = 0

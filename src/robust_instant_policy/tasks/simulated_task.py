@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, Protocol
 
 import numpy as np
 
+from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import RipError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.demonstrator import Stroke, perform
-from robust_instant_policy.tasks.motion import Arm, Motion, plan_poses, plan_waypoints
+from robust_instant_policy.tasks.motion import Arm, Motion, plan_onward, plan_poses, plan_waypoints
 from robust_instant_policy.tasks.scene_truth import SceneTruth
-from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink
+from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image
 from robust_instant_policy.trajectory import Trajectory
 
 HAND_STREAM = 1  # the demonstrator's random numbers, apart from the scene's
@@ -96,28 +98,52 @@ class SimulatedTask:
             self._rebuild(self._seed)
         control_hz = self._timing.control_hz
         motion = plan_waypoints(trajectory, self._arm, self.execute_hz, control_hz)
-        tracking_error = self._play(motion, on_frame)
+        tracking_error = self._play(motion, self._filming(on_frame))
         failure = self._spec.verdict(self._cell)
         return Execution(not failure, failure, len(motion.joints) / control_hz, tracking_error)
 
-    def demonstrate(self, seed: int, with_images: bool = False) -> Attempt:
+    def follow(self, controller: Controller, max_seconds: float, on_frame: FrameSink | None = None) -> Execution:
+        if self._seed is None:
+            raise RipError("there is no scene to act in; call reset(seed) first")
+        if not self._fresh:
+            self._rebuild(self._seed)
+        control_hz = self._timing.control_hz
+        before_step = self._filming(on_frame)
+        motion = Motion.at_home(self._arm)
+        steps, worst, failure = 0, 0.0, ""
+        while steps < max_seconds * control_hz and not failure:
+            waypoints = controller.act(self._cell.photograph().rgb, self._action(bool(motion.closed[-1])))
+            if waypoints is None:
+                break
+            try:
+                motion = plan_onward(waypoints, controller.rate_hz, motion, self._arm, control_hz)
+            except UnreachableError as error:
+                failure = f"refused after {steps / control_hz:.1f} s: {error}"
+            else:
+                worst = max(worst, self._play(motion, before_step))
+                steps += len(motion.joints)
+        self._rest(motion)
+        failure = failure or self._spec.verdict(self._cell)
+        return Execution(not failure, failure, steps / control_hz, worst)
+
+    def demonstrate(self, seed: int, with_images: bool = False, every: int = 1) -> Attempt:
         observation = self.reset(seed)
         rng = np.random.default_rng([seed, HAND_STREAM])
         strokes = self._spec.expert(self._cell, rng)
         poses, closed = perform(self._arm.home_pose, strokes, rng, self._timing.control_hz)
-        images: list[np.ndarray] = []
+        images: list[Image] = []
         try:
             motion = plan_poses(poses, closed, self._arm, self._timing.control_hz)
         except UnreachableError as error:
             failure = str(error)
         else:
             poses, closed = motion.poses, motion.closed
-            self._play(motion, None, images if with_images else None)
+            self._play(motion, self._photographing(images, self._recorded(poses, every)) if with_images else _nothing)
             self._rest(motion)
             failure = self._spec.verdict(self._cell)
-        recorded = slice(None, None, self._timing.record_every)
+        recorded = self._recorded(poses, every)
         trajectory = Trajectory.from_poses(poses[recorded], closed[recorded].astype(np.float64), self._arm.triangle)
-        demonstration = Demonstration(observation, trajectory, self.record_hz, self.name, seed)
+        demonstration = Demonstration(observation, trajectory, self.record_hz / every, self.name, seed)
         return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
 
     def scene_truth(self) -> SceneTruth:
@@ -131,22 +157,54 @@ class SimulatedTask:
         self._cell.reset(seed=seed)
         self._seed, self._fresh = seed, True
 
-    def _play(self, motion: Motion, on_frame: FrameSink | None, images: list[np.ndarray] | None = None) -> float:
+    def _recorded(self, poses: FloatArray, every: int) -> range:
+        """The control steps that are recorded, counted from the last: it is the one that was judged."""
+        interval = every * self._timing.record_every
+        return range((len(poses) - 1) % interval, len(poses), interval)
+
+    def _play(self, motion: Motion, before_step: Callable[[], None]) -> float:
         """Run the commands; the largest distance between the palm commanded and reached, in metres."""
         palm = np.array([0.0, 0.0, -self._arm.triangle.length])
         self._fresh = False
         worst = 0.0
-        for step, (joints, fingers, pose) in enumerate(zip(motion.joints, motion.fingers, motion.poses, strict=True)):
-            if images is not None and step % self._timing.record_every == 0:
-                images.append(self._cell.photograph().rgb)
-            if on_frame is not None and step % self._timing.frame_every == 0:
-                on_frame(self._cell.video_frame())
+        for joints, fingers, pose in zip(motion.joints, motion.fingers, motion.poses, strict=True):
+            before_step()
             self._cell.advance(np.append(joints, fingers))
             reached = self._cell.tool_pose()
             missed = (pose[:3, :3] @ palm + pose[:3, 3]) - (reached[:3, :3] @ palm + reached[:3, 3])
             worst = max(worst, float(np.linalg.norm(missed)))
         return worst
 
+    def _filming(self, on_frame: FrameSink | None) -> Callable[[], None]:
+        """To be called before every control step: hands out the frames of a video."""
+        if on_frame is None:
+            return _nothing
+        step = count()
+
+        def before_step() -> None:
+            if next(step) % self._timing.frame_every == 0:
+                on_frame(self._cell.video_frame())
+
+        return before_step
+
+    def _photographing(self, images: list[Image], steps: range) -> Callable[[], None]:
+        """To be called before every control step: adds to ``images`` what the camera sees before those of ``steps``."""
+        step = count()
+
+        def before_step() -> None:
+            if next(step) in steps:
+                images.append(self._cell.photograph().rgb)
+
+        return before_step
+
+    def _action(self, shut: bool) -> FloatArray:
+        """Where the gripper is, with the state ``shut`` that it was told to take, as an action ``(10,)``."""
+        return np.append(self._arm.triangle.triplets(self._cell.tool_pose()).ravel(), float(shut))
+
     def _rest(self, motion: Motion) -> None:
         for _ in range(int(SETTLE_SECONDS * self._timing.control_hz)):
             self._cell.advance(np.append(motion.joints[-1], motion.fingers[-1]))
+
+
+def _nothing() -> None:
+    """What happens before a control step that nobody looks at."""

@@ -35,7 +35,7 @@ class Execution:
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """One try of a demonstrator, at the recording rate; ``images (T, H, W, 3)`` uint8 where asked for."""
+    """One try of a demonstrator; ``images (T, H, W, 3)`` uint8, one for each of its steps, where asked for."""
 
     demonstration: Demonstration
     success: bool
@@ -78,8 +78,12 @@ class Task(Protocol):
         """
         ...
 
-    def demonstrate(self, seed: int, with_images: bool = False) -> Attempt:
-        """Let the demonstrator try the scene of ``seed``, in its own manner for that seed."""
+    def demonstrate(self, seed: int, with_images: bool = False, every: int = 1) -> Attempt:
+        """Let the demonstrator try the scene of ``seed``, in its own manner for that seed.
+
+        What is kept is every ``every``-th step of what was recorded, the last one included, with its image where
+        images are asked for: rendering them is what takes the time.
+        """
         ...
 
     def scene_truth(self) -> SceneTruth:
