@@ -11,6 +11,10 @@ GRAIN_PIXELS = 128
 GRAIN_LINES = 9  # across a face
 GRAIN_CONTRAST = 0.16
 
+LAMINATE: Color = (0.80, 0.80, 0.78)
+LAMINATE_PIXELS = 512
+LAMINATE_CONTRAST = 0.02
+
 
 def wood(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Fibres along the image's rows, as they run in a sawn board."""
@@ -23,3 +27,9 @@ def wood(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
     fibres += 0.5 * np.repeat(rng.normal(0.0, 1.0, (GRAIN_PIXELS, 1)), GRAIN_PIXELS, axis=1)
     shade = 1.0 + GRAIN_CONTRAST * fibres / np.abs(fibres).max()
     return (np.clip(np.array(color) * shade[..., None], 0.0, 1.0) * 255).astype(np.uint8)
+
+
+def laminate(rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The light grey, slightly speckled top of a laboratory table."""
+    speckle = rng.normal(0.0, 1.0, (LAMINATE_PIXELS, LAMINATE_PIXELS, 1))
+    return (np.clip(np.array(LAMINATE) * (1 + LAMINATE_CONTRAST * speckle), 0.0, 1.0) * 255).astype(np.uint8)

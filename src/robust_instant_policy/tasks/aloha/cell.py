@@ -1,0 +1,290 @@
+"""The cell of the ALOHA tasks: a table between two arms, a depth camera above it, and a camera for videos.
+
+The world's origin lies on the table, midway between the arms; x points from the left arm, which works, to the right
+arm, which stays parked; z is up. The image's top points along +x.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import mujoco
+import numpy as np
+
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.geometry import FloatArray, make_pose
+from robust_instant_policy.tasks.aloha.renderer import require_renderer
+from robust_instant_policy.tasks.aloha.robot import (
+    ARM_JOINTS,
+    CLOSED_M,
+    FINGER_TRAVEL_M,
+    FINGERS,
+    HOME_JOINTS,
+    PARKED,
+    PARKED_JOINTS,
+    TOOL,
+    WORKING,
+    site_pose,
+    two_arms,
+)
+from robust_instant_policy.tasks.aloha.surfaces import SOLID_GROUP, add_surface, box_surface
+from robust_instant_policy.tasks.scene_truth import SceneTruth
+from robust_instant_policy.tasks.textures import laminate
+
+CONTROL_HZ = 50.0  # ALOHA's own
+TIMESTEP_S = 0.002
+SETTLE_SECONDS = 0.4  # in which objects come to rest before anybody looks
+
+# Intel RealSense D415 at 640x480: the sides of its 65 x 40 degrees are cut off, the height stays.
+CAMERA_HEIGHT_M = 0.85
+CAMERA_X_M = -0.05
+CAMERA_WIDTH, CAMERA_HEIGHT = 640, 480
+CAMERA_FOV_DEG = 40.0  # vertical
+DEPTH_UNIT_M = 0.001
+VIDEO_WIDTH, VIDEO_HEIGHT = 480, 360
+
+TABLE_SIZE_M = (1.22, 0.76, 0.04)  # the table top of gym-aloha
+TABLE_FRICTION = 0.6
+NEAR_M, FAR_M = 0.05, 5.0
+
+STILL_RAD_S = 0.2  # joint speed below which an arm is at rest, as in the tasks of the other cell
+STILL_M_S = 0.02  # and an object
+HELD_N = 0.5  # force of each finger from which something is held
+
+WORKSPACE = np.array([[-0.30, -0.32, -0.005], [0.18, 0.32, 0.4]])
+
+
+class AlohaEnv(gymnasium.Env):
+    """Base of the five environments; a subclass adds its objects and says when they are where they should be.
+
+    Actions are the working arm's six joint angles (rad) and the travel of each finger (m, 0 closed), at `CONTROL_HZ`.
+    Observations are the same seven numbers as reached, ``joints``, and with ``obs_mode="rgbd"`` the camera's ``rgb``
+    and ``depth`` (metres). The reward is 1 where the task is done. ``objects`` as in `tasks.make_task`.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": int(CONTROL_HZ)}
+
+    def __init__(self, objects: str = "seen", obs_mode: str = "rgbd", render_mode: str | None = None):
+        require_renderer()
+        self.objects, self.obs_mode, self.render_mode = objects, obs_mode, render_mode
+        travel = [0.0], [FINGER_TRAVEL_M]
+        ranges = _joint_ranges()
+        low, high = (np.concatenate([ranges[:, i], travel[i]]).astype(np.float32) for i in (0, 1))
+        self.action_space = gymnasium.spaces.Box(low, high)
+        unbounded = gymnasium.spaces.Box(-np.inf, np.inf, (len(low),))
+        seen: dict[str, gymnasium.Space] = {"joints": unbounded}
+        if obs_mode == "rgbd":
+            shape = (CAMERA_HEIGHT, CAMERA_WIDTH)
+            seen["rgb"] = gymnasium.spaces.Box(0, 255, (*shape, 3), np.uint8)
+            seen["depth"] = gymnasium.spaces.Box(0.0, FAR_M, shape, np.float32)
+        self.observation_space = gymnasium.spaces.Dict(seen)
+        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
+        self._seed = 0
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add the episode's objects, drawn from `draw`, to ``spec``."""
+        raise NotImplementedError
+
+    def evaluate(self) -> dict[str, Any]:
+        """How things stand; ``success`` is bool."""
+        raise NotImplementedError
+
+    def draw(self, what: str) -> np.random.Generator:
+        """The episode's random numbers for ``what`` ("shape", "pose"), the same for the same seed."""
+        return np.random.default_rng([self._seed, *what.encode()])
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        super().reset(seed=seed)
+        self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
+        self._close_renderers()
+        spec = two_arms()
+        _furnish(spec)
+        self.build(spec)
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        for arm, joints, travel in ((WORKING, HOME_JOINTS, FINGER_TRAVEL_M), (PARKED, PARKED_JOINTS, 0.0)):
+            for joint, angle in zip(ARM_JOINTS, joints, strict=True):
+                self.data.joint(f"{arm}/{joint}").qpos = angle
+                self.data.actuator(f"{arm}/{joint}").ctrl = angle
+            for finger, side in zip(FINGERS, (1, -1), strict=True):
+                self.data.joint(f"{arm}/{finger}").qpos = side * (CLOSED_M + travel)
+            self.data.actuator(f"{arm}/{FINGERS[0]}").ctrl = CLOSED_M + travel
+        mujoco.mj_step(self.model, self.data, round(SETTLE_SECONDS / TIMESTEP_S))
+        mujoco.mj_forward(self.model, self.data)
+        self._joints_before = self._joints()
+        return self._observation(), {}
+
+    def step(self, action: FloatArray) -> tuple[dict, float, bool, bool, dict]:
+        self.advance(np.asarray(action, dtype=np.float64))
+        state = self.evaluate()
+        return self._observation(), float(state["success"]), False, False, state
+
+    def advance(self, command: FloatArray) -> None:
+        """One control step, with joint angles and finger travel ``(7,)`` commanded, judging nothing."""
+        self._joints_before = self._joints()
+        for joint, angle in zip(ARM_JOINTS, command, strict=False):
+            self.data.actuator(f"{WORKING}/{joint}").ctrl = angle
+        self.data.actuator(f"{WORKING}/{FINGERS[0]}").ctrl = CLOSED_M + command[-1]
+        mujoco.mj_step(self.model, self.data, round(1 / CONTROL_HZ / TIMESTEP_S))
+
+    def photograph(self) -> Observation:
+        """What the camera above the table sees now."""
+        renderer = self._renderer(CAMERA_WIDTH, CAMERA_HEIGHT)
+        renderer.update_scene(self.data, "top")
+        rgb = renderer.render()
+        renderer.enable_depth_rendering()
+        depth = renderer.render()
+        renderer.disable_depth_rendering()
+        focal = CAMERA_HEIGHT / 2 / np.tan(np.deg2rad(CAMERA_FOV_DEG) / 2)
+        intrinsics = [[focal, 0, (CAMERA_WIDTH - 1) / 2], [0, focal, (CAMERA_HEIGHT - 1) / 2], [0, 0, 1]]
+        axes = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
+        return Observation(
+            rgb=rgb,
+            depth=(np.rint(depth.astype(np.float64) / DEPTH_UNIT_M) * DEPTH_UNIT_M).astype(np.float32),
+            intrinsics=np.array(intrinsics),
+            camera_pose=make_pose(axes.T, (CAMERA_X_M, 0.0, CAMERA_HEIGHT_M)),
+        )
+
+    def scene_truth(self) -> SceneTruth:
+        """What each pixel of the top view shows, and where it is."""
+        renderer = self._renderer(CAMERA_WIDTH, CAMERA_HEIGHT)
+        renderer.update_scene(self.data, "top")
+        renderer.enable_segmentation_rendering()
+        seen = renderer.render()
+        renderer.disable_segmentation_rendering()
+        parts = np.full(seen.shape[:2], -1)
+        geoms = seen[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
+        parts[geoms] = self.model.geom_bodyid[seen[..., 0][geoms]]
+        bodies = range(self.model.nbody)
+        poses = [make_pose(self.data.xmat[body].reshape(3, 3), self.data.xpos[body]) for body in bodies]
+        return SceneTruth(parts, tuple(self.model.body(body).name for body in bodies), np.array(poses))
+
+    def video_frame(self) -> np.ndarray:
+        """RGB frame ``(H, W, 3)`` uint8 of the camera beside the table."""
+        renderer = self._renderer(VIDEO_WIDTH, VIDEO_HEIGHT)
+        renderer.update_scene(self.data, "side")
+        return renderer.render()
+
+    def render(self) -> np.ndarray | None:
+        return self.video_frame() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        self._close_renderers()
+
+    def tool_pose(self) -> FloatArray:
+        """Where the working arm's tool frame is, ``(4, 4)``."""
+        return site_pose(self.data, f"{WORKING}/{TOOL}")
+
+    def pose_of(self, body: str) -> FloatArray:
+        """Where a body is, ``(4, 4)``."""
+        place = self.data.body(body)
+        return make_pose(place.xmat.reshape(3, 3), place.xpos)
+
+    def arm_is_still(self) -> bool:
+        """Whether no joint of the working arm moved faster than `STILL_RAD_S` over the last control step."""
+        moved = np.abs(self._joints() - self._joints_before)[: len(ARM_JOINTS)]
+        return bool(moved.max() * CONTROL_HZ <= STILL_RAD_S)
+
+    def is_still(self, body: str) -> bool:
+        """Whether a body moves no faster than `STILL_M_S`."""
+        return bool(np.linalg.norm(self.data.joint(body).qvel[:3]) <= STILL_M_S)
+
+    def touch(self, body: str, other: str) -> float:
+        """Force, in N, with which two bodies press on each other."""
+        wanted = {self.model.body(body).id, self.model.body(other).id}
+        total, force = 0.0, np.zeros(6)
+        for index, contact in enumerate(self.data.contact[: self.data.ncon]):
+            if {int(self.model.geom_bodyid[geom]) for geom in contact.geom} == wanted:
+                mujoco.mj_contactForce(self.model, self.data, index, force)
+                total += float(force[0])
+        return total
+
+    def is_held(self, body: str) -> bool:
+        """Whether both fingers of the working arm press on a body."""
+        return all(self.touch(body, f"{WORKING}/{finger}_link") > HELD_N for finger in FINGERS)
+
+    def _joints(self) -> FloatArray:
+        angles = [self.data.joint(f"{WORKING}/{joint}").qpos[0] for joint in ARM_JOINTS]
+        return np.array([*angles, self.data.joint(f"{WORKING}/{FINGERS[0]}").qpos[0] - CLOSED_M])
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        seen: dict[str, np.ndarray] = {"joints": self._joints().astype(np.float32)}
+        if self.obs_mode == "rgbd":
+            photograph = self.photograph()
+            seen |= {"rgb": photograph.rgb, "depth": photograph.depth}
+        return seen
+
+    def _renderer(self, width: int, height: int) -> mujoco.Renderer:
+        if (width, height) not in self._renderers:
+            self._renderers[width, height] = mujoco.Renderer(self.model, height, width)
+        return self._renderers[width, height]
+
+    def _close_renderers(self) -> None:
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+
+
+def _joint_ranges() -> FloatArray:
+    model = two_arms().compile()
+    return np.array([model.joint(f"{WORKING}/{joint}").range for joint in ARM_JOINTS])
+
+
+def _furnish(spec: mujoco.MjSpec) -> None:
+    """Physics, table, light and cameras."""
+    option = spec.option
+    option.timestep, option.integrator = TIMESTEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone, option.noslip_iterations, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 3, 10.0
+    spec.stat.extent, spec.stat.center = 1.0, [0, 0, 0]
+    visual = spec.visual
+    visual.map.znear, visual.map.zfar = NEAR_M, FAR_M
+    visual.quality.shadowsize, visual.quality.offsamples = 2048, 4
+    getattr(visual, "global").offwidth = max(CAMERA_WIDTH, VIDEO_WIDTH)
+    getattr(visual, "global").offheight = max(CAMERA_HEIGHT, VIDEO_HEIGHT)
+    visual.headlight.active = 0
+
+    world = spec.worldbody
+    world.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[2, 2, 0.1],
+        friction=[TABLE_FRICTION, 5e-3, 2e-4],
+        condim=6,
+        group=SOLID_GROUP,
+    )
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.86, 0.88, 0.90],
+        rgb2=[0.62, 0.64, 0.66],
+        width=64,
+        height=384,
+    )
+    top = world.add_body(name="table-top", pos=[0, 0, -TABLE_SIZE_M[2] / 2])
+    add_surface(spec, top, "table-top", box_surface(TABLE_SIZE_M), laminate(np.random.default_rng(0)), shine=0.05)
+    for direction, diffuse, shadow in (((-0.15, 0.6, -1.0), 0.55, True), ((-0.3, -0.5, -1.0), 0.25, False)):
+        world.add_light(
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            dir=direction,
+            pos=[-1.5 * part for part in direction],
+            diffuse=[diffuse] * 3,
+            specular=[0.1] * 3,
+            ambient=[0.2] * 3,
+            castshadow=shadow,
+        )
+    camera = world.add_camera(name="top", pos=[CAMERA_X_M, 0, CAMERA_HEIGHT_M], fovy=CAMERA_FOV_DEG)
+    camera.quat = [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)]
+    add_side_camera(world)
+
+
+def add_side_camera(world: Any) -> None:
+    """A camera that looks at the table's middle from beside it."""
+    eye, target = np.array([-0.10, -0.80, 0.50]), np.array([-0.18, 0.0, 0.12])
+    back = (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, np.stack([right, np.cross(back, right), back], axis=1).ravel())
+    world.add_camera(name="side", pos=eye, quat=quaternion, fovy=48.0)

@@ -1,0 +1,16 @@
+"""Importing this module registers the environments with gymnasium: ``gymnasium.make("RIP-AlohaSweep-v1")``."""
+
+from __future__ import annotations
+
+import gymnasium
+
+MAX_EPISODE_STEPS = 3000  # a minute
+ENVIRONMENTS = {
+    "RIP-AlohaPickBanana-v1": "pick_banana:PickBananaEnv",
+}
+
+for name, entry_point in ENVIRONMENTS.items():
+    if name not in gymnasium.registry:
+        gymnasium.register(
+            name, entry_point=f"robust_instant_policy.tasks.aloha.{entry_point}", max_episode_steps=MAX_EPISODE_STEPS
+        )

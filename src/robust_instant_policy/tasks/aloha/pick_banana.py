@@ -1,0 +1,88 @@
+"""Pick a banana from the table and hold it up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.tasks.aloha.cell import AlohaEnv
+from robust_instant_policy.tasks.aloha.surfaces import Surface, add_bar, add_surface, free_body
+from robust_instant_policy.tasks.banana import Banana
+from robust_instant_policy.tasks.demonstrator import Stroke
+from robust_instant_policy.tasks.poses import downward, facing
+from robust_instant_policy.tasks.simulated_task import TaskSpec
+
+X_RANGE_M, Y_RANGE_M = (-0.22, 0.04), (-0.20, 0.20)
+YAW_RANGE_RAD = np.deg2rad(40)
+MASS_KG = 0.12
+SKIN_FRICTION = 0.8
+
+LIFTED_M = 0.05
+
+GRASP_HEIGHT_M = 0.004  # of the fingertips over the table
+ABOVE_M = 0.10
+LIFT_M = 0.15
+
+
+class PickBananaEnv(AlohaEnv):
+    """Success: the banana is off the table between both fingers, and the arm is still."""
+
+    shape: Banana
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        self.shape = Banana.draw(self.draw("shape"))
+        rng = self.draw("pose")
+        pose = facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
+        pose[2, 3] = self.shape.radius
+        body = free_body(spec, "banana", pose)
+        vertices, faces, _, uvs = self.shape.mesh()
+        add_surface(spec, body, "banana", Surface(vertices, faces, uvs), self.shape.skin(), shine=0.3)
+        capsules = self.shape.capsules()
+        volumes = np.array([radius**2 * np.linalg.norm(stop - start) for start, stop, radius in capsules])
+        for (start, stop, radius), mass in zip(capsules, MASS_KG * volumes / volumes.sum(), strict=True):
+            add_bar(body, start, stop, radius, mass=float(mass), friction=SKIN_FRICTION)
+
+    def middle(self) -> FloatArray:
+        """The banana's frame ``(4, 4)`` in the world: its middle, x along the fruit."""
+        return self.pose_of("banana")
+
+    def evaluate(self) -> dict[str, Any]:
+        lifted = bool(self.middle()[2, 3] > self.shape.radius + LIFTED_M)
+        held = self.is_held("banana")
+        return {"success": lifted and held and self.arm_is_still(), "lifted": lifted, "held": held}
+
+
+def pick(env: PickBananaEnv, rng: np.random.Generator) -> list[Stroke]:
+    """Come down over the middle, fingers across the fruit, close, lift and hold."""
+    pose = env.middle()
+    x, y = pose[:2, 3].tolist()
+    yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
+    lift = LIFT_M + rng.uniform(-0.02, 0.02)
+    return [
+        Stroke(np.array([downward(x, y, ABOVE_M, yaw)]), closed=False, free=True, speed=0.20, error=0.004),
+        Stroke(np.array([downward(x, y, GRASP_HEIGHT_M, yaw)]), closed=True, speed=0.08, error=0.0015),
+        Stroke(np.array([downward(x, y, lift, yaw)]), closed=True, speed=0.10, error=0.004),
+    ]
+
+
+def verdict(env: PickBananaEnv) -> str:
+    """Why the task failed, or nothing."""
+    state = env.evaluate()
+    if state["success"]:
+        return ""
+    if not state["held"]:
+        return "the banana slipped out of the fingers" if state["lifted"] else "the fingers hold no banana"
+    return "the banana is held but still moving" if state["lifted"] else "the banana was not lifted"
+
+
+SPEC = TaskSpec(
+    name="aloha-pick-banana",
+    description="pick the banana from the table",
+    goal="the banana is held above the table",
+    env_id="RIP-AlohaPickBanana-v1",
+    expert=pick,
+    verdict=verdict,
+)

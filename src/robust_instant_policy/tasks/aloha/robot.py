@@ -1,0 +1,152 @@
+"""The two ViperX 300 arms of ALOHA, from the models that come with the `gym-aloha` package.
+
+Shapes, masses and joint ranges are the package's. Its drives are stiffer than any servo and its collision shapes are
+the fingers' convex hulls; both are replaced here: position drives with the torques that Robotis publishes for the
+servos (Trossen Robotics lists which joint has which), and flat pads where the fingers touch things.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gym_aloha
+import mujoco
+import numpy as np
+
+from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pose
+from robust_instant_policy.tasks.kinematics import Kinematics
+from robust_instant_policy.tasks.motion import Arm
+
+MODEL_PATH = Path(gym_aloha.__file__).parent / "assets" / "bimanual_viperx_transfer_cube.xml"
+
+ARMS = ("vx300s_left", "vx300s_right")
+WORKING, PARKED = ARMS  # the arm that trajectories are for, and the one that stays where it is
+BASE_X_M = 0.469  # of the bases, to the left and right of the world's origin (gym-aloha)
+
+ARM_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
+FINGERS = ("left_finger", "right_finger")
+HAND = "gripper_link"
+TOOL = "tool"
+
+TOOL_LENGTH_M = 0.1537  # from the axis that turns the wrist to the tips of the fingers
+CLOSED_M = 0.0224  # reading of a finger's joint at which the pads touch
+FINGER_TRAVEL_M = 0.057 - CLOSED_M
+FINGER_SPEED_M_S = 0.10
+GRIP_FORCE_N = 15.0  # of each finger: ALOHA limits the gripper servo's current
+PAD_FRICTION = 1.2  # grip tape
+PAD_TORSION_M, PAD_ROLLING_M = 0.01, 1e-3
+
+SERVO_TORQUE_NM = (10.6, 21.2, 21.2, 10.6, 10.6, 4.1)  # XM540-W270, two of them at shoulder and elbow, XM430-W350
+SERVO_SPEED_RAD_S = np.pi  # XM540-W270: 30 rev/min
+STIFFNESS = (300.0, 500.0, 400.0, 60.0, 60.0, 30.0)  # N m/rad: 5 mm into the table press with some 10 N
+LAG_S = 0.03
+ARMATURE = 0.02  # kg m², the rotors' inertia seen through their gears
+FINGER_STIFFNESS = 2e3  # N/m
+
+HOME_JOINTS = (-1.4, -0.43, 0.434, 0.0, 1.567, 0.0)  # hand down, beside the arm, out of the camera's sight
+PARKED_JOINTS = (0.0, -1.8, 1.6, 0.0, 0.3, 0.0)
+
+TRIANGLE = GripperTriangle(length=TOOL_LENGTH_M, opening=2 * FINGER_TRAVEL_M)
+
+BLACK = (0.16, 0.16, 0.17, 1.0)
+GREY = (0.30, 0.30, 0.32, 1.0)
+
+
+def two_arms() -> mujoco.MjSpec:
+    """A model with nothing in it but the two arms, facing each other along x, the origin midway on the table."""
+    spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
+    spec.modelname = "aloha"
+    for things in (spec.keys, spec.actuators, spec.cameras, spec.lights, spec.textures, spec.materials):
+        for thing in list(things):
+            spec.delete(thing)
+    for body in list(spec.worldbody.bodies):
+        if body.name not in ARMS:
+            spec.delete(body)
+    spec.compiler.inertiagrouprange = [0, 5]
+    for arm, side in zip(ARMS, (-1, 1), strict=True):
+        spec.body(arm).pos = [side * BASE_X_M, 0.0, 0.0]
+        _refit(spec, arm)
+    return spec
+
+
+def _refit(spec: mujoco.MjSpec, arm: str) -> None:
+    """Give an arm its tool frame, pads, colours and drives."""
+    hand = spec.body(f"{arm}/{HAND}")
+    # The tool's z is the hand's approach x; its y is against the hand's y, so that the tool points straight down with
+    # yaw 0 where the arm reaches out without turning its wrist.
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, np.array([0.0, 0, 1, 0, -1, 0, 1, 0, 0]))
+    hand.add_site(name=f"{arm}/{TOOL}", pos=[TOOL_LENGTH_M, 0, 0], quat=quaternion, rgba=[0, 0, 0, 0])
+
+    for geom in spec.geoms:
+        if geom.name.startswith(arm):
+            finger = "finger" in geom.name
+            geom.rgba = GREY if finger else BLACK
+            geom.contype, geom.conaffinity = int(not finger and "base" not in geom.name), 0
+    for finger, side in zip(FINGERS, (1, -1), strict=True):
+        body = spec.body(f"{arm}/{finger}_link")
+        inner = -side * CLOSED_M  # the pad's face, in the finger's own frame
+        _pad(body, (0.0585, inner + side * 0.0025, 0.0), (0.0265, 0.0025, 0.0055))
+        _pad(body, (0.0150, inner + side * 0.0050, 0.0), (0.0170, 0.0050, 0.0250))
+
+    for joint, stiffness, torque in zip(ARM_JOINTS, STIFFNESS, SERVO_TORQUE_NM, strict=True):
+        _servo(spec, f"{arm}/{joint}", stiffness, LAG_S * stiffness, torque, ARMATURE)
+    for finger in FINGERS:
+        joint = spec.joint(f"{arm}/{finger}")
+        joint.frictionloss, joint.armature = 0.0, 0.05
+    _servo(spec, f"{arm}/{FINGERS[0]}", FINGER_STIFFNESS, 0.05 * FINGER_STIFFNESS, 2 * GRIP_FORCE_N, 0.05)
+    geared = spec.add_equality(name=f"{arm}/gear", type=mujoco.mjtEq.mjEQ_JOINT)
+    geared.name1, geared.name2 = f"{arm}/{FINGERS[1]}", f"{arm}/{FINGERS[0]}"
+    geared.data[:5] = [0.0, -1.0, 0.0, 0.0, 0.0]
+
+    for body in spec.bodies:
+        if body.name.startswith(arm):
+            body.gravcomp = 1.0
+
+
+def _pad(finger, position: tuple[float, float, float], size: tuple[float, float, float]) -> None:
+    finger.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=position,
+        size=size,
+        rgba=[0, 0, 0, 0],
+        mass=0.0,
+        condim=6,
+        priority=1,
+        friction=[PAD_FRICTION, PAD_TORSION_M, PAD_ROLLING_M],
+        contype=1,
+        conaffinity=0,
+    )
+
+
+def _servo(spec: mujoco.MjSpec, name: str, stiffness: float, damping: float, force: float, armature: float) -> None:
+    joint = spec.joint(name)
+    joint.frictionloss, joint.armature = 0.0, armature
+    servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    servo.set_to_position(kp=stiffness, kv=damping)
+    servo.forcelimited = True
+    servo.forcerange = [-force, force]
+
+
+def working_arm() -> Arm:
+    """The arm that trajectories are for, as the executor sees it."""
+    spec = two_arms()
+    for name in list(spec.actuators) + list(spec.equalities):
+        spec.delete(name)
+    spec.delete(spec.body(PARKED))
+    kinematics = Kinematics(spec.compile(), f"{WORKING}/{TOOL}", "site", len(ARM_JOINTS), np.eye(4))
+    return Arm(
+        kinematics=kinematics,
+        home=np.array(HOME_JOINTS),
+        triangle=TRIANGLE,
+        finger_travel=FINGER_TRAVEL_M,
+        finger_speed=FINGER_SPEED_M_S,
+        joint_speed=0.8 * SERVO_SPEED_RAD_S,
+        tool_speed=0.6,
+    )
+
+
+def site_pose(data: mujoco.MjData, name: str) -> FloatArray:
+    """World pose ``(4, 4)`` of a site."""
+    site = data.site(name)
+    return make_pose(site.xmat.reshape(3, 3), site.xpos)
