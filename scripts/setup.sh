@@ -45,6 +45,8 @@ fingerprint() { cat pyproject.toml constraints.txt scripts/setup.sh | sha256sum 
 # Prints nothing and succeeds if the simulator can render an image on this machine.
 renderer_works() { .venv/bin/python -m robust_instant_policy.tasks.maniskill.renderer >/dev/null 2>&1; }
 
+mujoco_renders() { .venv/bin/python -m robust_instant_policy.tasks.aloha.renderer >/dev/null 2>&1; }
+
 add_debian_backports() {
   # Debian 12's own Mesa (22.3) lacks the descriptor indexing that SAPIEN needs; its backports have 25.
   local list=/etc/apt/sources.list.d/robust-instant-policy-backports.sources
@@ -113,6 +115,12 @@ fi
 say "installing the package and its dependencies"
 "${pip[@]}" -e ".[$EXTRAS]"
 
+if ! mujoco_renders; then
+  say "no OpenGL that renders without a screen; installing Mesa's"
+  apt_install libegl1 libgl1-mesa-dri || true
+  mujoco_renders || apt_install libosmesa6 || true
+  mujoco_renders || die "needs OpenGL without a screen; install libegl1 and libgl1-mesa-dri, or libosmesa6, and run again"
+fi
 if ! renderer_works; then
   install_vulkan || die "needs a Vulkan driver; install mesa-vulkan-drivers (Mesa 23.1 or newer) and run again"
   renderer_works || die "the simulator still finds no renderer; see: .venv/bin/rip doctor"

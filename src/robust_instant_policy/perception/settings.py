@@ -29,3 +29,9 @@ class DescriptorSettings:
 
 PAPER_SIMULATION = DescriptorSettings(load_size=100, stride=2)
 PAPER_REAL = DescriptorSettings(load_size=240, stride=4)
+REAL_EDGE_PX = 480  # shorter edge from which an image is a real camera's; simulated ones are small
+
+
+def paper_settings(height: int, width: int) -> DescriptorSettings:
+    """The paper's column for images of ``height`` and ``width`` pixels."""
+    return PAPER_REAL if min(height, width) >= REAL_EDGE_PX else PAPER_SIMULATION

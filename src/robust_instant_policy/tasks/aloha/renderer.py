@@ -1,7 +1,7 @@
 """Which OpenGL MuJoCo renders with here: EGL or OSMesa, neither of which needs a screen or a graphics card.
 
 MuJoCo binds itself to one library when it is imported, and PyOpenGL never lets go of the first one it loaded. So each
-is tried in a process of its own. ``python -m`` this module to try the one that ``MUJOCO_GL`` names.
+is tried in a process of its own. ``python -m`` this module to see what is chosen.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from robust_instant_policy.errors import RendererError
 VARIABLE = "MUJOCO_GL"  # MuJoCo's own; what a user sets there stays
 BACKENDS = ("egl", "osmesa")
 TIMEOUT_S = 60
+MODULE = "robust_instant_policy.tasks.aloha.renderer"  # not `__name__`, which is "__main__" when it is run
 
 
 @cache
@@ -39,7 +40,7 @@ def require_renderer() -> str:
 def _try(backend: str) -> tuple[bool, str]:
     """Whether ``backend`` renders, and its name, or else why not."""
     environment = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
-    command = [sys.executable, "-m", __name__]
+    command = [sys.executable, "-m", MODULE, "once"]
     try:
         result = subprocess.run(
             command,
@@ -74,4 +75,7 @@ def _render() -> str:
 
 
 if __name__ == "__main__":
-    print(_render())
+    try:
+        print(_render() if sys.argv[1:] else require_renderer())
+    except RendererError as error:
+        sys.exit(str(error))

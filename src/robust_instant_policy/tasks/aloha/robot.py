@@ -80,9 +80,9 @@ def _refit(spec: mujoco.MjSpec, arm: str) -> None:
 
     for geom in spec.geoms:
         if geom.name.startswith(arm):
-            finger = "finger" in geom.name
-            geom.rgba = GREY if finger else BLACK
-            geom.contype, geom.conaffinity = int(not finger and "base" not in geom.name), 0
+            is_finger = "finger" in geom.name
+            geom.rgba = GREY if is_finger else BLACK
+            geom.contype, geom.conaffinity = int(not is_finger and "base" not in geom.name), 0
     for finger, side in zip(FINGERS, (1, -1), strict=True):
         body = spec.body(f"{arm}/{finger}_link")
         inner = -side * CLOSED_M  # the pad's face, in the finger's own frame

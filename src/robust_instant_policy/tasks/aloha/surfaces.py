@@ -25,7 +25,7 @@ class Surface:
     """Triangles ``faces (F, 3)`` over ``vertices (V, 3)`` in metres, with texture coordinates ``uvs (V, 2)``."""
 
     vertices: FloatArray
-    faces: NDArray[np.int64]
+    faces: NDArray[np.integer]
     uvs: FloatArray = field(repr=False)
 
 
@@ -63,16 +63,17 @@ def revolved(profile: ArrayLike, sides: int = 48, flat: bool = False) -> Surface
 def box_surface(size: ArrayLike) -> Surface:
     """A box of full ``size (3,)`` about the origin; every face shows the whole texture."""
     half = np.asarray(size, dtype=np.float64) / 2
-    vertices, faces, uvs = [], [], []
+    vertices: list[list[FloatArray]] = []
+    faces: list[list[int]] = []
     for axis in range(3):
         for sign in (-1.0, 1.0):
             normal, across = np.eye(3)[axis] * sign, np.eye(3)[(axis + 1) % 3]
             up = np.cross(normal, across)
-            first = 4 * len(uvs)
+            first = 4 * len(vertices)
             vertices.append([(normal + a * across + b * up) * half for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
             faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
-            uvs.append([[0, 0], [1, 0], [1, 1], [0, 1]])
-    return Surface(np.reshape(vertices, (-1, 3)), np.array(faces), np.reshape(uvs, (-1, 2)).astype(np.float64))
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    return Surface(np.reshape(vertices, (-1, 3)), np.array(faces), np.tile(corners, (6, 1)))
 
 
 def add_surface(spec: mujoco.MjSpec, body: Body, name: str, surface: Surface, image: Image, shine: float = 0.2) -> None:
