@@ -1,12 +1,38 @@
+"""Rows, statistics and tables; what workers do is in test_evaluation_workers.py."""
+
+import math
+from fractions import Fraction
+
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binomtest
 
-from robust_instant_policy.errors import DatasetError, InvalidValueError
-from robust_instant_policy.evaluation import Episode, EpisodeTable, success_table, wilson_interval
+from robust_instant_policy.errors import DatasetError, InvalidValueError, UnknownNameError
+from robust_instant_policy.evaluation import Choice, Episode, Scene, Suite, Variant, make_suites, open_episodes, paper
+from robust_instant_policy.evaluation.experiment import missing_work, wanted_plans
+from robust_instant_policy.evaluation.manifest import Manifest, session
+from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test, wilson_interval
+from robust_instant_policy.evaluation.summary import Summary
+from robust_instant_policy.evaluation.tables import tables
+
+RIP = Variant("rip", model="a model")
+KAT = Variant("kat", model="a model")
 
 
-def episode(method: str, seed: int, success: bool, candidate: int = 0, task: str = "push-cube") -> Episode:
+def episode(variant: Variant, seed: int, success: bool, candidate: int = 0, of: int = 1) -> Episode:
     return Episode(
-        task, "seen", method, 10, seed, candidate, success, 1.5, 5.0, 1000, None, "" if success else "missed"
+        scene=Scene("push-cube", "seen", seed),
+        variant=variant,
+        candidate=candidate,
+        candidates=of,
+        success=success,
+        seconds=1.5,
+        physics_seconds=0.5,
+        executed_seconds=5.0,
+        tokens=1000,
+        confidence=None,
+        failure="" if success else "missed",
     )
 
 
@@ -22,34 +48,151 @@ def test_more_successes_than_trials_are_refused():
         wilson_interval(3, 2)
 
 
+def test_the_t_test_gives_the_marks_that_the_paper_prints_for_its_own_table():
+    for method, marks in paper.TABLE1_MARKS.items():
+        assert mark(t_test(paper.TABLE1["rip"], paper.TABLE1[method])) == marks, method
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=30))
+def test_with_one_execution_a_scene_the_paired_test_is_mcnemars(outcomes):
+    scenes = [Scene("push-cube", "seen", seed) for seed in range(len(outcomes))]
+    ours = {scene: Fraction(int(first)) for scene, (first, _) in zip(scenes, outcomes, strict=True)}
+    theirs = {scene: Fraction(int(second)) for scene, (_, second) in zip(scenes, outcomes, strict=True)}
+    found = paired_test(ours, theirs)
+    discordant = found.better + found.worse
+    expected = binomtest(found.better, discordant, 0.5).pvalue if discordant else 1.0
+    assert found.p == pytest.approx(expected)
+
+
+def test_the_paired_test_looks_only_at_scenes_that_both_methods_were_tried_in():
+    ours = {Scene("push-cube", "seen", seed): Fraction(1) for seed in range(8)}
+    theirs = {Scene("push-cube", "seen", seed): Fraction(2, 5) for seed in range(2, 20)}
+    found = paired_test(ours, theirs)
+    assert (found.scenes, found.better, found.worse) == (6, 6, 0)
+    assert found.p == pytest.approx(2 / 2**6)  # all six the same way round, or all the other
+
+
+def test_what_a_method_does_not_use_does_not_tell_its_variants_apart():
+    assert Variant("kat", dof=3.0) == Variant("kat", dof=1.25)
+    assert Variant("neighbours", frames="world", model="a") == Variant("neighbours", frames="adaptive", model="b")
+    assert Variant("rip", dof=math.inf) == Variant("rip-gauss")
+    assert Variant("rip", dof=3.0) != Variant("rip", dof=1.5)
+
+
 def test_rows_survive_on_disk_and_go_on(tmp_path):
-    table = EpisodeTable(tmp_path / "out" / "episodes.parquet")
-    table.add([episode("kat", 1, True), episode("kat", 1, False, candidate=1)])
-    again = EpisodeTable(tmp_path / "out" / "episodes.parquet")
-    assert again.rows == table.rows
-    again.add([episode("rip", 1, True)])
-    assert EpisodeTable(again.path).scenes == {("push-cube", "seen", "kat", 10, 1), ("push-cube", "seen", "rip", 10, 1)}
-    assert [path.name for path in again.path.parent.iterdir()] == ["episodes.parquet"]
+    table = open_episodes(tmp_path / "out")
+    rows = [episode(KAT, 1, True, of=2), episode(KAT, 1, False, candidate=1, of=2)]
+    for row in rows:
+        table.add(row)
+    table.close()
+    again = open_episodes(tmp_path / "out")
+    assert again.rows == rows
+    again.add(episode(Variant("rip-gauss"), 1, True))
+    again.close()
+    assert open_episodes(tmp_path / "out").rows[-1].variant.dof == math.inf
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["episodes.parquet"]
 
 
-def test_a_leftover_of_a_killed_write_does_not_matter(tmp_path):
-    table = EpisodeTable(tmp_path / "episodes.parquet")
-    table.add([episode("rip", 1, True)])
-    (tmp_path / "episodes.partial").write_bytes(b"PAR1 half a file")
-    again = EpisodeTable(tmp_path / "episodes.parquet")
-    again.add([episode("rip", 2, False)])
-    assert len(EpisodeTable(again.path).rows) == 2
+def test_a_row_is_kept_once(tmp_path):
+    table = open_episodes(tmp_path)
+    table.add(episode(RIP, 1, True))
+    table.add(episode(RIP, 1, True))
+    assert len(table.rows) == 1
 
 
-def test_a_damaged_table_is_refused_in_one_line(tmp_path):
+def test_a_kill_at_any_moment_loses_no_row(tmp_path):
+    table = open_episodes(tmp_path)
+    for seed in range(3):
+        table.add(episode(RIP, seed, True))  # not closed: as after a kill
+    journal = tmp_path / "episodes.journal"
+    journal.write_text(journal.read_text() + '{"task": "push-cu')  # and a row of which half was written
+    again = open_episodes(tmp_path)
+    assert [row.scene.seed for row in again.rows] == [0, 1, 2]
+    again.add(episode(RIP, 3, True))
+    again.close()
+    assert len(open_episodes(tmp_path).rows) == 4
+
+
+def test_a_damaged_or_older_table_is_refused_in_one_line(tmp_path):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     (tmp_path / "episodes.parquet").write_bytes(b"PAR1 half a file")
     with pytest.raises(DatasetError, match="move it away"):
-        EpisodeTable(tmp_path / "episodes.parquet")
+        open_episodes(tmp_path)
+    pq.write_table(pa.table({"task": ["push-cube"], "method": ["rip"]}), tmp_path / "episodes.parquet")
+    with pytest.raises(DatasetError, match="--replay"):
+        open_episodes(tmp_path)
 
 
-def test_the_table_counts_every_execution_and_marks_the_best():
-    rows = [episode("rip", seed, True) for seed in range(4)]
-    rows += [episode("kat", seed, candidate < 2, candidate) for seed in range(4) for candidate in range(5)]
-    text = success_table(rows)
-    assert "| rip | 10 | **100%** (51% to 100%, n=4) | 100% |" in text
-    assert "| kat | 10 | 40% (22% to 61%, n=20) | 40% |" in text
+def test_work_goes_on_with_the_executions_that_are_missing(tmp_path):
+    suite = Suite("chosen", ("push-cube",), (RIP, KAT), (1, 2, 3))
+    rows = [episode(RIP, 1, True), episode(KAT, 1, True, of=2), episode(RIP, 2, True), episode(KAT, 2, True)]
+    works = missing_work(wanted_plans([suite]), [], rows, [], tmp_path, films=False)
+    assert [(work.scene.seed, work.variants) for work in works] == [(1, (KAT,)), (3, (RIP, KAT))]
+    assert (Scene("push-cube", "seen", 1), KAT, 0) in works[0].done
+
+
+def test_a_failed_episode_that_nobody_examined_is_work_left(tmp_path):
+    suite = Suite("chosen", ("push-cube",), (RIP,), (1,))
+    lost = episode(RIP, 1, False)
+    (work,) = missing_work(wanted_plans([suite]), [], [lost], [], tmp_path, films=False)
+    assert work.failed == (lost,)
+    assert not work.variants
+
+
+def test_suites_that_ask_for_the_same_plans_ask_once():
+    table1, demos = make_suites(["table1", "demos"], Choice(RIP, tasks=["push-cube"], methods=["rip"]))
+    both = wanted_plans([table1, demos])
+    assert len(both) == len(wanted_plans([demos])) == 50
+    assert len(make_suites(["all"], Choice(RIP))) == 6
+
+
+def test_the_suites_vary_what_the_paper_varies():
+    queries, dof = make_suites(["queries", "dof"], Choice(RIP))
+    assert [(one.queries, one.demos) for one in queries.variants] == [(2, 20), (3, 20), (5, 20), (10, 20)]
+    assert [one.dof for one in dof.variants] == [1.25, 1.5, 3.0, math.inf]
+    (downsampling,) = make_suites(["downsampling"], Choice(RIP))
+    assert "push-cube" not in downsampling.tasks
+
+
+def test_an_unknown_suite_task_or_method_is_told():
+    with pytest.raises(UnknownNameError, match="table1"):
+        make_suites(["table7"], Choice(RIP))
+    with pytest.raises(UnknownNameError, match="push-cube"):
+        make_suites(["table1"], Choice(RIP, tasks=["fly"]))
+    with pytest.raises(UnknownNameError, match="rip-gauss"):
+        make_suites(["table1"], Choice(RIP, methods=["magic"]))
+
+
+def test_the_table_counts_every_execution_marks_the_best_and_shows_the_papers_number():
+    suite = Suite("table1", ("push-cube",), (RIP, KAT), tuple(range(4)))
+    rows = [episode(RIP, seed, True) for seed in range(4)]
+    rows += [episode(KAT, seed, candidate < 2, candidate, of=5) for seed in range(4) for candidate in range(5)]
+    success, tests = (table.markdown() for table in tables(Summary(suite, rows)))
+    assert "| rip | **100** (51 to 100) | 100 | 100 ± 0 | 100 ± 0 |" in success
+    assert "| kat | 40 (22 to 61) | 74 | 40 ± 0 | 74 ± 0 |" in success
+    assert "| kat | +60.0 | – | 4 | 4 | 0 | 0.125 |" in tests
+
+
+@pytest.mark.parametrize("name", ["demos", "queries", "dof", "downsampling"])
+def test_every_analysis_has_a_table_even_when_half_is_missing(name):
+    (suite,) = make_suites([name], Choice(RIP, tasks=["pick-banana"], methods=["rip"], num_scenes=2))
+    scene = suite.scenes[0]
+    row = episode(suite.variants[0], scene.seed, True)
+    row = Episode(**{**vars(row), "scene": scene})
+    (table,) = tables(Summary(suite, [row]))
+    assert "100" in table.markdown()
+    assert table.html().count("<tr>") == len(table.rows) + 1
+
+
+def test_a_run_remembers_its_suites_and_the_commands_that_made_it(tmp_path):
+    one = Suite("table1", ("push-cube",), (RIP,), (1,))
+    two = Suite("table1", ("turn-faucet",), (Variant("rip-gauss"),), (1, 2))
+    for suite in (one, two):
+        with session(tmp_path, [suite], ["rip", "eval", "--out", "a b"], "a model"):
+            pass
+    manifest = Manifest.read(tmp_path)
+    assert manifest.suites == (one.merged(two),)
+    assert manifest.suites[0].tasks == ("push-cube", "turn-faucet")
+    assert [one.command for one in manifest.sessions] == ["rip eval --out 'a b'"] * 2

@@ -97,11 +97,17 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--out", type=Path, default=Path("plan.json"), metavar="FILE")
     _method_options(plan)
 
-    evaluate = command("eval", _eval, "success rates of methods over tasks; goes on where it stopped")
-    evaluate.add_argument("--tasks", nargs="+", default=["push-cube"], metavar="TASK")
-    evaluate.add_argument("--methods", nargs="+", default=["rip", "rip-gauss", "kat"], metavar="METHOD")
+    evaluate = command("eval", _eval, "the paper's evaluation, or a part of it; goes on where it stopped")
+    evaluate.add_argument(
+        "--suite", nargs="+", metavar="SUITE", help="analyses of the paper: table1 demos queries dof downsampling "
+        "trajectories, or all (default: just --methods in --tasks)"
+    )  # fmt: skip
+    evaluate.add_argument("--tasks", nargs="+", metavar="TASK", help="default: push-cube, or those of the suite")
+    evaluate.add_argument(
+        "--methods", nargs="+", metavar="METHOD", help="default: rip rip-gauss kat, or those of the suite"
+    )
     evaluate.add_argument("--demos", type=_positive, default=10, metavar="N")
-    evaluate.add_argument("--episodes", type=_positive, default=10, metavar="N")
+    evaluate.add_argument("--episodes", type=_positive, default=10, metavar="N", help="scenes (default: %(default)s)")
     evaluate.add_argument("--queries", type=_positive, default=5, metavar="Q")
     evaluate.add_argument("--seed", type=_natural, default=0)
     evaluate.add_argument("--llm", default="embedded")
@@ -109,6 +115,9 @@ def _parser() -> argparse.ArgumentParser:
         "--objects", choices=("seen", "unseen"), default="seen", help="test with objects like those shown, or others"
     )
     evaluate.add_argument("--replay", action="store_true", help="answer from the stored samples only, without a model")
+    evaluate.add_argument("--workers", type=_positive, default=1, metavar="N", help="processes (default: %(default)s)")
+    evaluate.add_argument("--ray", metavar="ADDRESS", help="work on the Ray cluster at this address ('auto': this one)")
+    evaluate.add_argument("--no-videos", action="store_true", help="do not film failed episodes once more")
     evaluate.add_argument("--out", type=Path, required=True, metavar="DIR")
     _method_options(evaluate)
 
@@ -233,19 +242,37 @@ def _plan(options: argparse.Namespace) -> int:
 
 
 def _eval(options: argparse.Namespace) -> int:
-    from robust_instant_policy.evaluate import evaluate
-    from robust_instant_policy.evaluation import Experiment
+    from robust_instant_policy.evaluate import STORE_FILE, evaluate
+    from robust_instant_policy.evaluation import Choice, Setup, Variant, make_suites
+    from robust_instant_policy.llm import model_name
 
-    experiment = Experiment(
-        tasks=options.tasks,
-        methods=options.methods,
-        num_demonstrations=options.demos,
-        num_episodes=options.episodes,
-        seed=options.seed,
-        num_queries=options.queries,
-        objects=options.objects,
+    base = Variant(
+        "rip",
+        demos=options.demos,
+        queries=options.queries,
+        downsampling=options.downsampling,
+        frames=options.frames,
+        layout=options.layout,
+        features=options.features,
+        model=model_name(options.llm),
     )
-    evaluate(experiment, options.llm, options.replay, options.out, DEFAULT_DATA, _method_settings(options))
+    choice = Choice(base, options.tasks, options.methods, options.episodes, options.seed, options.objects)
+    setup = Setup(
+        llm=options.llm,
+        replay=options.replay,
+        store=options.out / STORE_FILE,
+        data=DEFAULT_DATA,
+        deadline_s=float(options.deadline),
+        films=not options.no_videos,
+    )
+    evaluate(
+        make_suites(options.suite or ["chosen"], choice),
+        setup,
+        options.out,
+        options.workers,
+        options.ray,
+        ["rip", *sys.argv[1:]],
+    )
     return 0
 
 

@@ -1,60 +1,49 @@
-"""`rip eval`: an experiment on the screen, with its samples and rows on disk."""
+"""`rip eval`: suites on the screen, with their samples and rows on disk, then tables, figures and a page."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from robust_instant_policy.console import StageConsole
-from robust_instant_policy.errors import UnknownNameError
-from robust_instant_policy.evaluation import Episode, Experiment, run_experiment, success_table
-from robust_instant_policy.llm import RecordedModel, ReplayedModel, SampleStore, connect, model_name
-from robust_instant_policy.policies import METHOD_NAMES, InstantPolicy
-from robust_instant_policy.tasks import TASK_NAMES
-from robust_instant_policy.tasks.task import Task
+from robust_instant_policy.evaluation import Analysis, Episode, Progress, Setup, Suite, run_suites
+from robust_instant_policy.evaluation.episodes import EPISODES_FILE
+from robust_instant_policy.evaluation.manifest import session
+from robust_instant_policy.evaluation.processes import Processes
+from robust_instant_policy.evaluation.publication import publish
+from robust_instant_policy.evaluation.work import Hands, Outcome
+from robust_instant_policy.llm import model_name
 
 STORE_FILE = "samples.sqlite"
 
 
 def evaluate(
-    experiment: Experiment, llm_spec: str, replay: bool, out: Path, data: Path, options: dict[str, Any]
+    suites: Sequence[Suite], setup: Setup, out: Path, workers: int, ray: str | None, arguments: Sequence[str]
 ) -> None:
-    """Run what is missing of ``experiment`` and print its table.
+    """Run what is missing of ``suites`` with ``workers`` processes, or on the Ray cluster at the address ``ray``.
 
-    Every answer of the model is kept in ``out/samples.sqlite``; with ``replay`` no model is asked at all.
+    ``arguments`` are the words of the command, noted in the run's folder.
     """
-    for kind, names, known in (
-        ("task", experiment.tasks, TASK_NAMES),
-        ("method", experiment.methods, METHOD_NAMES),
-    ):
-        for name in names:
-            if name not in known:
-                raise UnknownNameError(kind, name, known)
     screen = StageConsole()
-    out.mkdir(parents=True, exist_ok=True)
-    store = SampleStore(out / STORE_FILE)
-    model = ReplayedModel(store, model_name(llm_spec)) if replay else RecordedModel(connect(llm_spec), store)
 
-    def make_instant(task: Task) -> InstantPolicy:
-        return InstantPolicy(model, workspace=task.workspace, **options)
-
-    def on_recording(task: str, there: int, count: int, thrown_away: int) -> None:
+    def recording(task: str, there: int, count: int, thrown_away: int) -> None:
         screen.done_so_far(f"{task}: recording ({thrown_away} thrown away)", there, count)
 
-    def on_episodes(done: int, total: int, rows: list[Episode]) -> None:
-        for row in rows:
-            verdict = "success" if row.success else f"failed: {row.failure}"
-            screen.say(f"  {row.task} {row.method} scene {row.seed} #{row.candidate}: {verdict}")
+    def outcome(done: int, total: int, what: Outcome | None) -> None:
+        if isinstance(what, Analysis):
+            failure = what.failure
+            screen.say(f"  {failure.scene} {failure.variant} #{failure.candidate}: lost by {failure.stage}")
+        elif isinstance(what, Episode):
+            verdict = "success" if what.success else f"failed: {what.failure}"
+            screen.say(f"  {what.scene} {what.variant} #{what.candidate}: {verdict}")
         screen.done_so_far("plans executed", done, total)
 
-    try:
-        with screen.stage("evaluation"):
-            table = run_experiment(
-                experiment, out, data, make_instant, on_recording=on_recording, on_episodes=on_episodes
-            )
-    finally:
-        model.close()
-        store.close()
+    with session(out, suites, arguments, model_name(setup.llm)), screen.stage("evaluation"):
+        run_suites(suites, setup, out, _hands(workers, ray), Progress(recording, outcome))
     screen.say("")
-    screen.say(success_table(table.rows))
-    screen.say(f"rows: {table.path}")
+    screen.say(publish(out))
+    screen.say(f"rows: {out / EPISODES_FILE}")
+
+
+def _hands(workers: int, ray: str | None) -> Hands:
+    return Processes(workers)

@@ -1,24 +1,32 @@
-"""Evaluation: rollouts, resumable experiments, statistics, tables."""
+"""Evaluation: suites of rollouts done by workers, rows, statistics, failure analysis, tables and figures."""
 
-from robust_instant_policy.evaluation.episodes import Episode, EpisodeTable
-from robust_instant_policy.evaluation.experiment import (
-    Experiment,
-    obtain_demonstrations,
-    run_experiment,
-    scene_seed,
-)
-from robust_instant_policy.evaluation.rollout import roll_out
+from robust_instant_policy.evaluation.episodes import Episode, open_episodes
+from robust_instant_policy.evaluation.experiment import Progress, run_suites
+from robust_instant_policy.evaluation.failures import Failure, open_failures
+from robust_instant_policy.evaluation.rows import RowFile
+from robust_instant_policy.evaluation.scenes import obtain_demonstrations, scene_seed
 from robust_instant_policy.evaluation.statistics import wilson_interval
-from robust_instant_policy.evaluation.table import success_table
+from robust_instant_policy.evaluation.suites import SUITE_NAMES, Choice, Suite, make_suites
+from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.evaluation.work import Analysis, Setup
 
 __all__ = [
+    "SUITE_NAMES",
+    "Analysis",
+    "Choice",
     "Episode",
-    "EpisodeTable",
-    "Experiment",
+    "Failure",
+    "Progress",
+    "RowFile",
+    "Scene",
+    "Setup",
+    "Suite",
+    "Variant",
+    "make_suites",
     "obtain_demonstrations",
-    "roll_out",
-    "run_experiment",
+    "open_episodes",
+    "open_failures",
+    "run_suites",
     "scene_seed",
-    "success_table",
     "wilson_interval",
 ]

@@ -1,130 +1,137 @@
-"""Experiments: methods × tasks × scenes, resumable at any moment."""
+"""Experiments: suites of variants in scenes, done by workers, kept row by row, resumable at any moment."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
-from robust_instant_policy.demonstration import Demonstration
-from robust_instant_policy.errors import NoDemonstrationsError
-from robust_instant_policy.evaluation.episodes import Episode, EpisodeTable
-from robust_instant_policy.evaluation.rollout import roll_out
-from robust_instant_policy.evaluation.table import success_table
-from robust_instant_policy.policies import InstantPolicy, make_policy
+from robust_instant_policy.datasets.files import write_whole
+from robust_instant_policy.evaluation.episodes import Episode, open_episodes
+from robust_instant_policy.evaluation.failures import Failure, open_failures, video_file
+from robust_instant_policy.evaluation.scenes import count_demonstrations, obtain_demonstrations
+from robust_instant_policy.evaluation.suites import Suite
+from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.evaluation.work import Hands, Outcome, Planned, SceneWork, Setup
 from robust_instant_policy.tasks import make_task
-from robust_instant_policy.tasks.record import record
-from robust_instant_policy.tasks.task import Task
 
-FIRST_TEST_SEED = 100_000  # demonstrations draw scenes from 0 on, tests from here on
-SEEDS_A_RUN = 1_000  # apart, so that runs with different --seed share no scene
-
-
-def scene_seed(seed: int, index: int) -> int:
-    """Seed of the ``index``-th test scene of a run with ``--seed seed``."""
-    return FIRST_TEST_SEED + seed * SEEDS_A_RUN + index
-
-
-def obtain_demonstrations(
-    task: Task, folder: Path, count: int, on_progress: Callable[[int, int, int], None] | None = None
-) -> list[Demonstration]:
-    """The first ``count`` demonstrations of ``task`` in ``folder``, recorded now where they are not there yet.
-
-    ``on_progress`` receives (episodes there, episodes wanted, attempts thrown away).
-    """
-    try:
-        there = len(load_demonstrations(folder, task=task.name))
-    except NoDemonstrationsError:
-        there = 0
-    if there < count:
-        with DatasetWriter(folder, task=task.name, description=task.description, rate_hz=task.record_hz) as writer:
-            record(task, writer, count, on_progress=on_progress)
-    return load_demonstrations(folder, task=task.name, limit=count)
+Plan = tuple[Scene, Variant]
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """What is compared: every method in ``num_episodes`` fresh scenes of every task."""
-
-    tasks: Sequence[str]
-    methods: Sequence[str]
-    num_demonstrations: int = 10
-    num_episodes: int = 10
-    seed: int = 0
-    num_queries: int = 5
-    objects: str = "seen"
-
-    @property
-    def num_plans(self) -> int:
-        return len(self.tasks) * len(self.methods) * self.num_episodes
-
-
-def run_experiment(
-    experiment: Experiment,
-    out: Path,
-    data: Path,
-    make_instant: Callable[[Task], InstantPolicy],
-    *,
-    on_recording: Callable[[str, int, int, int], None],
-    on_episodes: Callable[[int, int, list[Episode]], None],
-) -> EpisodeTable:
-    """Run what is missing of ``experiment`` in ``out/episodes.parquet`` and write ``out/table.md``.
-
-    Demonstrations are kept in ``data/TASK`` and recorded where they are missing. All methods of a scene share
-    the samples of one instant policy. ``on_episodes`` receives (plans done, plans in all, new rows).
+class Progress:
+    """Called as the run goes on: ``recording(task, there, wanted, thrown away)``, ``outcome(plans done, plans wanted,
+    what has just come, or None at the start)``.
     """
-    table = EpisodeTable(out / "episodes.parquet")
-    done = 0
-    for task_name in experiment.tasks:
-        scenes = table.scenes
-        missing = {
-            seed: methods
-            for seed in (scene_seed(experiment.seed, index) for index in range(experiment.num_episodes))
-            if (
-                methods := [
-                    method
-                    for method in experiment.methods
-                    if (task_name, experiment.objects, method, experiment.num_demonstrations, seed) not in scenes
-                ]
-            )
-        }
-        done += experiment.num_episodes * len(experiment.methods) - sum(map(len, missing.values()))
-        on_episodes(done, experiment.num_plans, [])
-        if not missing:
+
+    recording: Callable[[str, int, int, int], None]
+    outcome: Callable[[int, int, Outcome | None], None]
+
+
+def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, progress: Progress) -> None:
+    """Run what is missing of ``suites`` in ``out``: episodes, and the analysis of those that failed.
+
+    Demonstrations are kept in ``setup.data/TASK`` and recorded where they are missing. What several suites ask for is
+    done once, and everything in one scene together, so that its samples are asked for once.
+    """
+    with closing(open_episodes(out)) as episodes, closing(open_failures(out)) as failures:
+        wanted = wanted_plans(suites)
+        left = executions_left(episodes.rows)
+        done = sum(left.get(plan) == 0 for plan in wanted)
+        progress.outcome(done, len(wanted), None)
+        kept = wanted_plans(suite for suite in suites if suite.keeps_plans)
+        works = missing_work(wanted, kept, episodes.rows, failures.rows, out, setup.films)
+        if not works:
+            return
+        _record_missing(works, setup, progress)
+        for outcome in hands(setup, works):
+            if isinstance(outcome, Episode):
+                episodes.add(outcome)
+                plan = outcome.scene, outcome.variant
+                left[plan] = left.get(plan, outcome.candidates) - 1
+                done += left[plan] == 0
+            elif isinstance(outcome, Planned):
+                path = out / plan_file(outcome.scene, outcome.variant)
+                path.parent.mkdir(exist_ok=True)
+                outcome.plan.save(path)
+            else:
+                failure = outcome.failure
+                if outcome.video:
+                    write_whole(out / video_file(failure.scene, failure.variant, failure.candidate), outcome.video)
+                failures.add(failure)
+            progress.outcome(done, len(wanted), outcome)
+
+
+def wanted_plans(suites: Iterable[Suite]) -> list[Plan]:
+    """Every plan that ``suites`` ask for, once, those of one scene together."""
+    by_scene: dict[Scene, dict[Variant, None]] = {}
+    for suite in suites:
+        for scene in suite.scenes:
+            by_scene.setdefault(scene, {}).update(dict.fromkeys(suite.variants))
+    return [(scene, variant) for scene, variants in by_scene.items() for variant in variants]
+
+
+def executions_left(rows: Iterable[Episode]) -> dict[Plan, int]:
+    """How many executions the plans that were begun still lack."""
+    left: dict[Plan, int] = {}
+    for row in rows:
+        plan = row.scene, row.variant
+        left[plan] = left.get(plan, row.candidates) - 1
+    return left
+
+
+def plan_file(scene: Scene, variant: Variant) -> str:
+    """Where, in a run's folder, a plan is kept that is to be drawn."""
+    return f"plans/{scene}-{variant}.json"
+
+
+def missing_work(
+    wanted: Sequence[Plan],
+    kept: Sequence[Plan],
+    rows: Sequence[Episode],
+    failures: Sequence[Failure],
+    out: Path,
+    films: bool,
+) -> list[SceneWork]:
+    """What is still to be done for the ``wanted`` plans, of which those ``kept`` go into files, scene by scene."""
+    left = executions_left(rows)
+    among = set(wanted)
+    examined = {row.key for row in failures}
+    variants: dict[Scene, list[Variant]] = {scene: [] for scene, _ in wanted}
+    for scene, variant in wanted:
+        if left.get((scene, variant)) != 0:
+            variants[scene].append(variant)
+    done: dict[Scene, set] = {scene: set() for scene in variants}
+    failed: dict[Scene, list[Episode]] = {scene: [] for scene in variants}
+    for row in rows:
+        if (row.scene, row.variant) in among:
+            done[row.scene].add(row.key)
+            filmed = not films or row.executed_seconds == 0 or (out / video_file(*row.key)).exists()
+            if not row.success and not (row.key in examined and filmed):
+                failed[row.scene].append(row)
+    plans: dict[Scene, list[Variant]] = {scene: [] for scene in variants}
+    for scene, variant in kept:
+        if not (out / plan_file(scene, variant)).exists():
+            plans[scene].append(variant)
+    return [
+        SceneWork(scene, tuple(todo), frozenset(done[scene]), tuple(failed[scene]), tuple(plans[scene]))
+        for scene, todo in variants.items()
+        if todo or failed[scene] or plans[scene]
+    ]
+
+
+def _record_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:
+    most: dict[str, int] = {}
+    for work in works:
+        most[work.scene.task] = max(most.get(work.scene.task, 0), work.demos)
+    for name, count in most.items():
+        if count_demonstrations(setup.data / name, name) >= count:
             continue
-        task = make_task(task_name)
+        task = make_task(name)
         try:
-            demonstrations = obtain_demonstrations(
-                task,
-                data / task_name,
-                experiment.num_demonstrations,
-                partial(on_recording, task_name),
+            obtain_demonstrations(
+                task, setup.data / name, count, lambda *so_far, name=name: progress.recording(name, *so_far)
             )
-            instant = make_instant(task)
-            policies = {
-                method: make_policy(method, instant, experiment.num_queries).fit(demonstrations)
-                for method in dict.fromkeys(method for methods in missing.values() for method in methods)
-            }
-            if experiment.objects != "seen":
-                task.close()
-                task = make_task(task_name, experiment.objects)
-            for seed, methods in missing.items():
-                observation = task.reset(seed)
-                for method in methods:
-                    rows = roll_out(
-                        task,
-                        policies[method],
-                        observation,
-                        seed,
-                        experiment.num_demonstrations,
-                        experiment.objects,
-                    )
-                    table.add(rows)
-                    (out / "table.md").write_text(success_table(table.rows))
-                    done += 1
-                    on_episodes(done, experiment.num_plans, rows)
         finally:
             task.close()
-    return table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Collection, Iterator
 from functools import partial
 
 import numpy as np
@@ -12,74 +13,84 @@ from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError, PlanningError, UnreachableError
 from robust_instant_policy.evaluation.episodes import Episode
+from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import ClosedLoopPolicy, Policy
-from robust_instant_policy.tasks.task import Task
+from robust_instant_policy.tasks.task import Execution, FrameSink, Task
+from robust_instant_policy.trajectory import Trajectory
 
 
 def roll_out(
     task: Task,
     policy: Policy | ClosedLoopPolicy,
     observation: Observation,
-    seed: int,
-    num_demonstrations: int,
-    objects: str = "seen",
-) -> list[Episode]:
-    """Plan from ``observation`` and execute what the policy wants executed, each from a fresh reset to ``seed``.
+    scene: Scene,
+    variant: Variant,
+    done: Collection[int] = (),
+) -> Iterator[Episode]:
+    """Plan from ``observation``, of the task's last reset, and execute what the policy wants executed.
 
-    Methods that share an instant policy share its samples if they are given the same observation object.
-    A plan that cannot be made, or that the arm refuses, is a failed episode, not an error.
+    Every execution starts from a fresh build of the scene; those numbered in ``done`` are left out. Methods that share
+    an instant policy share its samples if they are given the same observation object. A plan that cannot be made, or
+    that the arm refuses, is a failed episode, not an error.
     """
-    row = partial(
-        Episode, task=task.name, objects=objects, method=policy.name, demos=num_demonstrations, seed=seed, candidate=0
-    )
+    row = partial(Episode, scene=scene, variant=variant)
     if isinstance(policy, ClosedLoopPolicy):
-        return [_follow(task, policy, observation, seed, row)]
+        yield _follow(task, policy, observation, row)
+        return
     start = time.perf_counter()
     try:
         plan = policy.plan(observation)
     except (KeypointError, PlanningError) as error:
-        return [
-            row(
-                success=False,
-                seconds=time.perf_counter() - start,
-                executed_seconds=0.0,
-                tokens=0,
-                confidence=None,
-                failure=f"no plan: {error}",
-            )
-        ]
-    episodes = []
-    for index, trajectory in enumerate(policy.executions(plan)):
-        task.reset(seed)
-        try:
-            execution = task.execute(trajectory)
-            success, seconds, failure = execution.success, execution.seconds, execution.failure
-        except UnreachableError as error:
-            success, seconds, failure = False, 0.0, f"refused: {error}"
-        episodes.append(
-            row(
-                candidate=index,
-                success=success,
-                seconds=plan.usage.seconds,
-                executed_seconds=seconds,
-                tokens=plan.usage.tokens,
-                confidence=plan.confidence,
-                failure=failure,
-            )
+        yield row(
+            candidate=0,
+            candidates=1,
+            success=False,
+            seconds=time.perf_counter() - start,
+            physics_seconds=0.0,
+            executed_seconds=0.0,
+            tokens=0,
+            confidence=None,
+            failure=f"no plan: {error}",
         )
-    return episodes
+        return
+    trajectories = policy.executions(plan)
+    for index, trajectory in enumerate(trajectories):
+        if index in done:
+            continue
+        start = time.perf_counter()
+        execution = execute(task, trajectory)
+        yield row(
+            candidate=index,
+            candidates=len(trajectories),
+            success=execution.success,
+            seconds=plan.usage.seconds,
+            physics_seconds=time.perf_counter() - start,
+            executed_seconds=execution.seconds,
+            tokens=plan.usage.tokens,
+            confidence=plan.confidence,
+            failure=execution.failure,
+        )
 
 
-def _follow(
-    task: Task, policy: ClosedLoopPolicy, observation: Observation, seed: int, row: partial[Episode]
-) -> Episode:
+def execute(task: Task, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
+    """Execute ``trajectory`` in the task's scene; one that the arm refuses is an execution that failed."""
+    try:
+        return task.execute(trajectory, on_frame)
+    except UnreachableError as error:
+        return Execution(success=False, failure=f"refused: {error}", seconds=0.0, tracking_error=0.0)
+
+
+def _follow(task: Task, policy: ClosedLoopPolicy, observation: Observation, row: partial[Episode]) -> Episode:
+    start = time.perf_counter()
     controller = _Timed(policy.controller(observation))
-    task.reset(seed)
     execution = task.follow(controller, policy.max_seconds)
     return row(
+        candidate=0,
+        candidates=1,
         success=execution.success,
         seconds=controller.seconds,
+        physics_seconds=time.perf_counter() - start - controller.seconds,
         executed_seconds=execution.seconds,
         tokens=0,
         confidence=None,

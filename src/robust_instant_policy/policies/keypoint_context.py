@@ -80,3 +80,7 @@ class KeypointContext:
                 located = self.extractor.locate(observation)
             self._seen = observation, located, watch.stages[0]
         return self._seen[1:]
+
+    def assume(self, observation: Observation, located: Located) -> None:
+        """Have `locate` answer ``located`` for this observation object: the truth, when a failure is taken apart."""
+        self._seen = observation, located, Stage("keypoints", 0.0)

@@ -1,0 +1,178 @@
+"""``failures.parquet``: which stage lost a failed episode, found by replacing stages with the truth one by one.
+
+The robot, the keypoints, the samples and the regression are asked in this order, and the first that is to blame is:
+
+- *execution*: the demonstrator's own trajectory for the scene, thinned out and played back like a plan, fails too;
+- *keypoints*: with the true keypoints in place of those that perception found, the same method succeeds;
+- *regression*: one of the very candidates that were aggregated succeeds by itself;
+- *samples*: none of them does, or the candidate that failed is a sample taken at its word.
+
+A policy in closed loop has no such stages; beyond the execution, its failures are its own (*policy*).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from robust_instant_policy.datasets.video import VideoEncoder
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import KeypointError, PlanningError
+from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey
+from robust_instant_policy.evaluation.rollout import execute
+from robust_instant_policy.evaluation.rows import RowFile
+from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.perception import Located
+from robust_instant_policy.perception.accuracy import KnownScene, measure
+from robust_instant_policy.policies import ClosedLoopPolicy, KeypointContext, Policy
+from robust_instant_policy.tasks.task import FrameSink, Task
+from robust_instant_policy.trajectory import Trajectory, downsample
+
+FAILURES_FILE = "failures.parquet"
+VIDEO_FOLDER = "videos"
+STAGES = ("keypoints", "samples", "regression", "execution", "policy")
+
+
+@dataclass(frozen=True)
+class Failure:
+    """The ``stage`` to which a failed episode is laid, and what was found on the way; None where nobody looked.
+
+    ``demonstrator`` says whether the demonstrator's trajectory succeeds when played back, ``true_keypoints`` whether
+    the method succeeds with the true keypoints, ``good_candidate`` whether one of the candidates that were aggregated
+    does by itself; ``keypoint_error`` is the largest error, in metres, of a keypoint found on an object.
+    """
+
+    scene: Scene
+    variant: Variant
+    candidate: int
+    stage: str
+    demonstrator: bool
+    true_keypoints: bool | None
+    keypoint_error: float | None
+    good_candidate: bool | None
+
+    @property
+    def key(self) -> EpisodeKey:
+        return self.scene, self.variant, self.candidate
+
+
+def open_failures(folder: Path) -> RowFile[Failure]:
+    """The rows of ``folder/failures.parquet``."""
+    return RowFile(Failure, folder / FAILURES_FILE)
+
+
+def video_file(scene: Scene, variant: Variant, candidate: int) -> str:
+    """Where, in a run's folder, the video of an episode is kept."""
+    return f"{VIDEO_FOLDER}/{scene}-{variant}-{candidate}.mp4"
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The true keypoints of a scene; where a keypoint lies on nothing that moves, the one that was found.
+
+    ``error`` is the largest distance, in metres, between a keypoint found on an object and the truth.
+    """
+
+    located: Located
+    error: float
+
+
+def true_keypoints(
+    task: Task, seed: int, context: KeypointContext, shown: Sequence[Demonstration], shown_truth: Sequence[KnownScene]
+) -> Truth | None:
+    """Where the keypoints of ``context``, fitted to ``shown``, are in the scene of ``seed``; None where it cannot say.
+
+    ``shown_truth`` is the simulator's knowledge of the demonstrations' own scenes.
+    """
+    observation = task.reset(seed)
+    images = [demonstration.observation for demonstration in shown]
+    try:
+        accuracy = measure(context.extractor, images, shown_truth, [observation], [task.scene_truth()])
+    except KeypointError:
+        return None
+    found, truth = accuracy.located[0], accuracy.truth[0]
+    if not accuracy.on_object:
+        return Truth(found, 0.0)
+    known = np.where(np.isnan(truth), found.keypoints, truth)
+    return Truth(replace(found, keypoints=known), float(np.nanmax(accuracy.errors)))
+
+
+class Inquest:
+    """Takes the failed episodes of one scene apart; what several of them need is tried only once."""
+
+    def __init__(self, task: Task, scene: Scene):
+        self._task, self._scene = task, scene
+        self._replayed: dict[str, bool] = {}
+
+    def examine(
+        self,
+        episode: Episode,
+        policy: Policy | ClosedLoopPolicy,
+        observation: Observation,
+        context: KeypointContext,
+        truth: Callable[[], Truth | None],
+    ) -> Failure:
+        """Lay ``episode``, in which ``policy`` failed from ``observation``, at one stage's door.
+
+        ``context`` is what the policy knows of keypoints. Raises `ModelError` where samples are missing that the
+        method would need with the true keypoints.
+        """
+        found = Failure(episode.scene, episode.variant, episode.candidate, "policy", True, None, None, None)
+        if not self._demonstrator_succeeds(episode.variant.downsampling):
+            return replace(found, stage="execution", demonstrator=False)
+        if isinstance(policy, ClosedLoopPolicy):
+            return found
+        known = truth()
+        if known is None:
+            return replace(found, stage="keypoints")
+        self._task.reset(self._scene.seed)
+        better = self._succeeds_with(known.located, policy, observation, context, episode.candidate)
+        found = replace(found, true_keypoints=better, keypoint_error=known.error)
+        if better:
+            return replace(found, stage="keypoints")
+        try:
+            plan = policy.plan(observation)
+        except PlanningError:
+            return replace(found, stage="samples", good_candidate=False)
+        if any(trajectory is candidate for trajectory in policy.executions(plan) for candidate in plan.candidates):
+            return replace(found, stage="samples", good_candidate=False)
+        good = any(self._plays(candidate) for candidate in plan.candidates)
+        return replace(found, stage="regression" if good else "samples", good_candidate=good)
+
+    def _demonstrator_succeeds(self, downsampling: str) -> bool:
+        if downsampling not in self._replayed:
+            shown = self._task.demonstrate(self._scene.seed).demonstration.trajectory
+            self._task.reset(self._scene.seed)
+            self._replayed[downsampling] = self._plays(downsample(shown, downsampling))
+        return self._replayed[downsampling]
+
+    def _succeeds_with(
+        self, located: Located, policy: Policy, observation: Observation, context: KeypointContext, candidate: int
+    ) -> bool:
+        same = replace(observation)  # the same scene, as another object: what was planned before does not count
+        context.assume(same, located)
+        try:
+            trajectories = policy.executions(policy.plan(same))
+        except PlanningError:
+            return False
+        return self._plays(trajectories[min(candidate, len(trajectories) - 1)])
+
+    def _plays(self, trajectory: Trajectory) -> bool:
+        return execute(self._task, trajectory).success
+
+
+def film(task: Task, policy: Policy | ClosedLoopPolicy, observation: Observation, candidate: int) -> bytes:
+    """The episode once more, in the task's scene, as an MP4; empty where nothing moved."""
+    encoder = VideoEncoder(task.video_hz)
+    sink: FrameSink = encoder.add
+    if isinstance(policy, ClosedLoopPolicy):
+        task.follow(policy.controller(observation), policy.max_seconds, sink)
+    else:
+        try:
+            execute(task, policy.executions(policy.plan(observation))[candidate], sink)
+        except (KeypointError, PlanningError):
+            return b""
+    return encoder.finish()

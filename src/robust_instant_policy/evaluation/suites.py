@@ -1,0 +1,146 @@
+"""The paper's analyses as data: which variants are tried in which scenes (Oh et al. 2025, Sec. V)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from robust_instant_policy.errors import UnknownNameError, UsageError
+from robust_instant_policy.evaluation.scenes import scene_seed
+from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.policies import METHOD_NAMES
+from robust_instant_policy.tasks import TASK_NAMES
+
+SIMULATION_TASKS = ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")
+ALOHA_TASKS = ("aloha-pick-banana", "aloha-hang", "aloha-sweep", "aloha-pick-place", "aloha-cup-upright")
+# "tasks in which gripper actions were essential"
+GRIPPER_TASKS = ("pick-banana", "aloha-pick-banana", "aloha-hang", "aloha-pick-place", "aloha-cup-upright")
+DEMOS = (1, 3, 5, 10, 20)
+QUERIES = (2, 3, 5, 10)
+DOFS = (1.25, 1.5, 3.0, math.inf)
+HYPERPARAMETER_DEMOS = 20  # shown where Q and ν are varied
+SAMPLING_METHODS = ("rip", "rip-gauss", "kat")  # those of the paper that share their samples
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Every one of ``variants`` in the new scenes ``seeds`` of every task, with "seen" or "unseen" ``objects``."""
+
+    name: str
+    tasks: tuple[str, ...]
+    variants: tuple[Variant, ...]
+    seeds: tuple[int, ...]
+    objects: str = "seen"
+
+    def __post_init__(self) -> None:
+        for kind, names, known in (
+            ("task", self.tasks, TASK_NAMES),
+            ("method", [variant.method for variant in self.variants], METHOD_NAMES),
+        ):
+            for name in names:
+                if name not in known:
+                    raise UnknownNameError(kind, name, known)
+
+    @property
+    def scenes(self) -> list[Scene]:
+        return [Scene(task, self.objects, seed) for task in self.tasks for seed in self.seeds]
+
+    @property
+    def keeps_plans(self) -> bool:
+        """Whether plans are kept, to be drawn."""
+        return self.name == "trajectories"
+
+    def merged(self, other: Suite) -> Suite:
+        """This and another suite of the same name and objects as one."""
+        return replace(
+            self,
+            tasks=tuple(dict.fromkeys((*self.tasks, *other.tasks))),
+            variants=tuple(dict.fromkeys((*self.variants, *other.variants))),
+            seeds=tuple(dict.fromkeys((*self.seeds, *other.seeds))),
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the user asked for; None where the suite decides as the paper does."""
+
+    base: Variant
+    tasks: Sequence[str] | None = None
+    methods: Sequence[str] | None = None
+    num_scenes: int = 10
+    seed: int = 0
+    objects: str = "seen"
+
+
+def make_suite(name: str, choice: Choice) -> Suite:
+    """The analysis called ``name``, one of `SUITE_NAMES`; raises `UnknownNameError` for others."""
+    if name not in _SUITES:
+        raise UnknownNameError("suite", name, (*SUITE_NAMES, "all"))
+    tasks, variants = _SUITES[name](choice)
+    if not tasks:
+        raise UsageError(f"none of the chosen tasks is one that suite {name} is about")
+    seeds = tuple(scene_seed(choice.seed, index) for index in range(choice.num_scenes))
+    return Suite(name, tuple(tasks), tuple(dict.fromkeys(variants)), seeds, choice.objects)
+
+
+def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:
+    """The analyses called ``names``, of which "all" stands for every one."""
+    wanted = [one for name in names for one in (SUITE_NAMES if name == "all" else (name,))]
+    return [make_suite(name, choice) for name in dict.fromkeys(wanted)]
+
+
+def _tasks(choice: Choice, of_paper: Sequence[str]) -> list[str]:
+    return list(choice.tasks) if choice.tasks else [task for task in of_paper if task in TASK_NAMES]
+
+
+def _methods(choice: Choice, default: Sequence[str] = METHOD_NAMES) -> list[Variant]:
+    return [_with_method(choice.base, method) for method in choice.methods or default]
+
+
+def _with_method(base: Variant, method: str) -> Variant:
+    return replace(base, method=method)
+
+
+def _table1(choice: Choice) -> tuple[list[str], list[Variant]]:
+    return _tasks(choice, (*SIMULATION_TASKS, *ALOHA_TASKS)), _methods(choice)
+
+
+def _demos(choice: Choice) -> tuple[list[str], list[Variant]]:
+    variants = [replace(variant, demos=demos) for variant in _methods(choice) for demos in DEMOS]
+    return _tasks(choice, SIMULATION_TASKS), variants
+
+
+def _queries(choice: Choice) -> tuple[list[str], list[Variant]]:
+    base = replace(choice.base, demos=HYPERPARAMETER_DEMOS)
+    return _tasks(choice, SIMULATION_TASKS), [replace(base, queries=queries) for queries in QUERIES]
+
+
+def _dof(choice: Choice) -> tuple[list[str], list[Variant]]:
+    base = replace(choice.base, demos=HYPERPARAMETER_DEMOS)
+    return _tasks(choice, SIMULATION_TASKS), [replace(base, dof=dof) for dof in DOFS]
+
+
+def _downsampling(choice: Choice) -> tuple[list[str], list[Variant]]:
+    tasks = [task for task in _tasks(choice, GRIPPER_TASKS) if task in GRIPPER_TASKS]
+    return tasks, [replace(choice.base, downsampling=way) for way in ("uniform", "masked")]
+
+
+def _trajectories(choice: Choice) -> tuple[list[str], list[Variant]]:
+    return _tasks(choice, ("push-cube",)), _methods(choice, SAMPLING_METHODS)
+
+
+def _chosen(choice: Choice) -> tuple[list[str], list[Variant]]:
+    return list(choice.tasks or ("push-cube",)), _methods(choice, SAMPLING_METHODS)
+
+
+_SUITES = {
+    "chosen": _chosen,
+    "table1": _table1,
+    "demos": _demos,
+    "queries": _queries,
+    "dof": _dof,
+    "downsampling": _downsampling,
+    "trajectories": _trajectories,
+}
+SUITE_NAMES = tuple(name for name in _SUITES if name != "chosen")  # "chosen": what tasks and methods say

@@ -1,0 +1,240 @@
+"""The paper's tables, with intervals and tests that it lacks."""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from robust_instant_policy.evaluation import paper
+from robust_instant_policy.evaluation.episodes import Episode
+from robust_instant_policy.evaluation.failures import STAGES, Failure
+from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test
+from robust_instant_policy.evaluation.summary import Rate, Summary, reference
+from robust_instant_policy.evaluation.variant import Variant
+
+NONE = "–"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells of text, in which ``**`` makes bold; ``note`` says how to read them."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str
+
+    def markdown(self) -> str:
+        lines = [self.head, tuple("---" for _ in self.head), *self.rows]
+        return "\n".join(f"| {' | '.join(line)} |" for line in lines) + f"\n\n{self.note}\n"
+
+    def html(self) -> str:
+        head = "".join(f"<th>{_html(cell)}</th>" for cell in self.head)
+        rows = "".join("<tr>" + "".join(f"<td>{_html(cell)}</td>" for cell in row) + "</tr>" for row in self.rows)
+        return f"<table><tr>{head}</tr>{rows}</table><p class='note'>{_html(self.note)}</p>"
+
+
+def _html(cell: str) -> str:
+    return re.sub(r"\*\*(\S.*?)\*\*", r"<b>\1</b>", html.escape(cell)).replace("\\*", "*")
+
+
+def tables(summary: Summary) -> list[Table]:
+    """All tables of a suite."""
+    return _TABLES[summary.suite.name](summary)
+
+
+def success_table(summary: Summary) -> Table:
+    """Table I: one row a method, for each task the success rate in percent and the paper's own beside it."""
+    ours = reference(summary.variants)
+    told = [task for task in summary.tasks if task in paper.TABLE1_TASKS]
+    head = ["method"]
+    for task in summary.tasks:
+        head += [task, "paper"] if task in told else [task]
+    rows = []
+    for variant in summary.variants:
+        row = [_name(variant, summary)]
+        for task in summary.tasks:
+            row.append(_cell(summary.rate(variant, task), summary.best(task)))
+            if task in told:
+                row.append(_percent(paper.table1(variant.method, task)))
+        stars = ""
+        if ours is not None and variant != ours:
+            stars = mark(t_test(summary.of_tasks(ours), summary.of_tasks(variant)))
+            stars = stars if _mean(summary, ours) > _mean(summary, variant) else ""
+        row += [_spread(summary, variant, stars), _paper_average(variant, told)]
+        rows.append(tuple(row))
+    counts = ", ".join(f"{variant.method} {_executions(summary, variant)}" for variant in summary.variants)
+    return Table(
+        (*head, "average", "paper"),
+        tuple(rows),
+        "Success in percent; in parentheses Wilson's 95% interval; the best of a task is bold. Averages are mean ± "
+        "standard deviation over tasks; RIP is significantly better than those marked \\* or \\*\\* (t-test as in the "
+        f"paper, p < 0.05 and p < 0.005). Executions a task: {counts}.",
+    )
+
+
+def test_table(summary: Summary) -> Table | None:
+    """RIP against every other method; None where there is no other."""
+    ours = reference(summary.variants)
+    others = [variant for variant in summary.variants if variant != ours]
+    if ours is None or not others:
+        return None
+    rows = []
+    for variant in others:
+        paired = paired_test(summary.of_scenes(ours), summary.of_scenes(variant))
+        difference = 100 * (_mean(summary, ours) - _mean(summary, variant))
+        rows.append(
+            (
+                _name(variant, summary),
+                f"{difference:+.1f}",
+                _p(t_test(summary.of_tasks(ours), summary.of_tasks(variant))),
+                str(paired.scenes),
+                str(paired.better),
+                str(paired.worse),
+                _p(paired.p),
+            )
+        )
+    head = ("rip against", "difference", "t-test p", "shared scenes", "rip better in", "worse in", "paired p")
+    note = (
+        "Difference in percentage points of the averages over tasks. The t-test is the paper's, over tasks; the paired "
+        "test is exact, over the scenes that both methods were tried in (McNemar's where each has one execution)."
+    )
+    return Table(head, tuple(rows), note)
+
+
+def sweep_table(summary: Summary, name: str, value: Callable[[Variant], str]) -> Table:
+    """One row a task, one column a value of what is varied."""
+    head = ("task", *(f"{name} = {value(variant)}" for variant in summary.variants))
+    rows = [
+        (task, *(_cell(summary.rate(variant, task), summary.best(task)) for variant in summary.variants))
+        for task in summary.tasks
+    ]
+    rows.append(("average", *(_spread(summary, variant) for variant in summary.variants)))
+    counts = dict.fromkeys(_executions(summary, variant) for variant in summary.variants)
+    return Table(head, tuple(rows), f"{_reading(summary)} Executions a task: {', '.join(counts)}.")
+
+
+def demos_table(summary: Summary) -> Table:
+    """One row a method, one column a number of demonstrations."""
+    methods = list(dict.fromkeys(variant.method for variant in summary.variants))
+    counts = sorted({variant.demos for variant in summary.variants})
+    rows = []
+    for method in methods:
+        of_count = {variant.demos: variant for variant in summary.variants if variant.method == method}
+        cells = []
+        for count in counts:
+            pooled = summary.rate(of_count[count]) if count in of_count else None
+            if pooled is None:
+                cells.append(NONE)
+                continue
+            low, high = pooled.interval
+            cells.append(f"{_spread(summary, of_count[count])} ({100 * low:.0f} to {100 * high:.0f})")
+        rows.append((method, *cells))
+    return Table(
+        ("method", *(f"{count} shown" for count in counts)),
+        tuple(rows),
+        f"Success in percent, mean ± standard deviation over {', '.join(summary.tasks)}; in parentheses Wilson's 95% "
+        "interval of all executions together.",
+    )
+
+
+def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> Table:
+    """How the failed episodes of each method share out over the stages that lost them."""
+    keys = {row.key for row in episodes}
+    known = [failure for failure in failures if failure.key in keys]
+    methods = list(dict.fromkeys(row.variant.method for row in episodes))
+    rows = []
+    for method in methods:
+        executions = [row for row in episodes if row.variant.method == method]
+        lost = sum(not row.success for row in executions)
+        stages = [failure.stage for failure in known if failure.variant.method == method]
+        cells = [f"{stages.count(stage)} ({stages.count(stage) / lost:.0%})" if lost else NONE for stage in STAGES]
+        rows.append((method, str(len(executions)), str(lost), *cells, str(lost - len(stages))))
+    return Table(
+        ("method", "executions", "failed", *(f"{stage} off" for stage in STAGES), "not examined"),
+        tuple(rows),
+        "Each failed episode is laid at the first stage that is to blame when parts are replaced by the truth, one by "
+        "one: execution (the demonstrator's own trajectory, played back, fails), keypoints (with the true ones it "
+        "succeeds), regression (one of its candidates succeeds by itself), else samples. A closed-loop policy has no "
+        "such stages.",
+    )
+
+
+def _name(variant: Variant, summary: Summary) -> str:
+    same = [other for other in summary.variants if other.method == variant.method]
+    return variant.method if len(same) == 1 else str(variant)
+
+
+def _mean(summary: Summary, variant: Variant) -> float:
+    return summary.over_tasks(variant)[0]
+
+
+def _cell(rate: Rate | None, best: float) -> str:
+    if rate is None:
+        return NONE
+    low, high = rate.interval
+    text = f"{100 * rate.value:.0f}"
+    return f"{f'**{text}**' if rate.value == best else text} ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def _spread(summary: Summary, variant: Variant, stars: str = "") -> str:
+    mean, deviation = summary.over_tasks(variant)
+    return f"{100 * mean:.0f}{stars.replace('*', chr(92) + '*')} ± {100 * deviation:.0f}"
+
+
+def _percent(value: int | None) -> str:
+    return NONE if value is None else str(value)
+
+
+def _paper_average(variant: Variant, tasks: Sequence[str]) -> str:
+    values = [value for task in tasks if (value := paper.table1(variant.method, task)) is not None]
+    if not values:
+        return NONE
+    mean = sum(values) / len(values)
+    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / len(values))
+    return f"{mean:.0f} ± {deviation:.0f}"
+
+
+def _executions(summary: Summary, variant: Variant) -> str:
+    counts = [rate.trials for task in summary.tasks if (rate := summary.rate(variant, task)) is not None]
+    return str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
+
+
+def _reading(summary: Summary) -> str:
+    return (
+        f"Success of {summary.variants[0].method} in percent, {summary.variants[0].demos} demonstrations shown; in "
+        "parentheses Wilson's 95% interval; the best of a task is bold. Averages: mean ± standard deviation over tasks."
+    )
+
+
+def _p(value: float) -> str:
+    return NONE if math.isnan(value) else f"{value:.3f}{mark(value).replace('*', chr(92) + '*')}"
+
+
+def _with_tests(summary: Summary) -> list[Table]:
+    tests = test_table(summary)
+    return [success_table(summary), *([tests] if tests else [])]
+
+
+def _downsampling(summary: Summary) -> list[Table]:
+    table = sweep_table(summary, "downsampling", lambda variant: variant.downsampling)
+    told = [str(paper.DOWNSAMPLING[variant.downsampling]) for variant in summary.variants]
+    row = ("paper, average of five tasks", *told)
+    return [Table(table.head, (*table.rows, row), table.note)]
+
+
+def _dof(variant: Variant) -> str:
+    return "∞" if variant.dof is None or math.isinf(variant.dof) else f"{variant.dof:g}"
+
+
+_TABLES: dict[str, Callable[[Summary], list[Table]]] = {
+    "chosen": _with_tests,
+    "table1": _with_tests,
+    "demos": lambda summary: [demos_table(summary)],
+    "queries": lambda summary: [sweep_table(summary, "Q", lambda variant: str(variant.queries))],
+    "dof": lambda summary: [sweep_table(summary, "ν", _dof)],
+    "downsampling": _downsampling,
+    "trajectories": lambda summary: [success_table(summary)],
+}

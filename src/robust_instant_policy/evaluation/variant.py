@@ -1,0 +1,68 @@
+"""A method with its settings, and the scenes it is tried in: what identifies a row, whatever run it comes from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from robust_instant_policy.policies import ASKING_METHODS, DOF, REGRESSING_METHODS
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A method with every setting that its plans depend on, beside demonstrations and scene.
+
+    ``demos`` demonstrations are shown; ``queries`` is the paper's Q, ``dof`` its ν; ``downsampling``, ``frames``,
+    ``layout`` and ``features`` are those of `InstantPolicy`; ``model`` names the language model. What a method does
+    not use is always empty (``dof`` None), so that the same work is never done, nor counted, under two names; RIP
+    with ν = ∞ is "rip-gauss".
+    """
+
+    method: str
+    demos: int = 10
+    queries: int = 5
+    dof: float | None = DOF
+    downsampling: str = "masked"
+    frames: str = "adaptive"
+    layout: str = "factorised"
+    features: str = "auto"
+    model: str = ""
+
+    def __post_init__(self) -> None:
+        changed: dict[str, str | float | None] = {}
+        if self.method == "rip" and self.dof is not None and math.isinf(self.dof):
+            changed["method"] = "rip-gauss"
+        if self.method == "rip-gauss":
+            changed["dof"] = math.inf
+        elif self.method not in REGRESSING_METHODS:
+            changed["dof"] = None
+        if self.method not in ASKING_METHODS:
+            changed |= {"frames": "", "layout": "", "model": ""}
+        for name, value in changed.items():
+            object.__setattr__(self, name, value)
+
+    def __str__(self) -> str:
+        """Everything but the model, in a few words that also make a file name."""
+        dof = "" if self.dof is None else f"v{self.dof:g}"
+        words = (
+            self.method,
+            f"{self.demos}demos",
+            f"q{self.queries}",
+            dof,
+            self.downsampling,
+            self.frames,
+            self.layout,
+        )
+        return "-".join(word for word in words if word)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A drawn scene of ``task``, with ``objects`` that are "seen" in the demonstrations or "unseen"."""
+
+    task: str
+    objects: str
+    seed: int
+
+    def __str__(self) -> str:
+        return f"{self.task}-{self.objects}-{self.seed}"
