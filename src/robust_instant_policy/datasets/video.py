@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -26,6 +26,7 @@ X264_OPTIONS = {
     "mbtree": "0",
     "rc-lookahead": "0",
 }
+FILM_OPTIONS = {"preset": "veryfast", "crf": "26"}  # to be looked at, in a page: a tenth of the size
 MAX_RATE_DENOMINATOR = 1001  # as in 30000/1001 Hz
 
 
@@ -37,10 +38,11 @@ def rate_fraction(rate_hz: float) -> Fraction:
 class VideoEncoder:
     """Makes an MP4 of images ``(H, W, 3)`` uint8, H and W even, one by one.
 
-    The same images give the same bytes every time, and frame t is shown at exactly t / rate.
+    The same images give the same bytes every time, and frame t is shown at exactly t / rate. ``options`` are x264's:
+    `X264_OPTIONS` for images that are data, `FILM_OPTIONS` for a film that is only looked at.
     """
 
-    def __init__(self, rate_hz: float):
+    def __init__(self, rate_hz: float, options: Mapping[str, str] = X264_OPTIONS):
         self._rate = rate_fraction(rate_hz)
         self._buffer = io.BytesIO()
         self._container = av.open(self._buffer, "w", format="mp4")
@@ -48,7 +50,7 @@ class VideoEncoder:
         self._stream.pix_fmt = PIXEL_FORMAT
         self._stream.codec_context.time_base = 1 / self._rate
         self._stream.codec_context.thread_count = 1
-        self._stream.options = X264_OPTIONS
+        self._stream.options = dict(options)
         self.num_images = 0
 
     def add(self, image: NDArray[np.uint8]) -> None:

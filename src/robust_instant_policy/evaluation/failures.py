@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robust_instant_policy.datasets.video import VideoEncoder
+from robust_instant_policy.datasets.video import FILM_OPTIONS, VideoEncoder
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import KeypointError, PlanningError
 from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey
@@ -166,7 +166,7 @@ class Inquest:
 
 def film(task: Task, policy: Policy | ClosedLoopPolicy, observation: Observation, candidate: int) -> bytes:
     """The episode once more, in the task's scene, as an MP4; empty where nothing moved."""
-    encoder = VideoEncoder(task.video_hz)
+    encoder = VideoEncoder(task.video_hz, FILM_OPTIONS)
     sink: FrameSink = encoder.add
     if isinstance(policy, ClosedLoopPolicy):
         task.follow(policy.controller(observation), policy.max_seconds, sink)

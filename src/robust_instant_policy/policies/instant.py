@@ -73,6 +73,7 @@ class InstantPolicy:
             progress=progress,
         )
         self.prompt = InContextPrompt(frames=frames, layout=layout)
+        self._written: Sequence[Trajectory] = ()
         self._heard: _Heard | None = None
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> InstantPolicy:
@@ -80,10 +81,11 @@ class InstantPolicy:
 
         The very same demonstrations once more cost nothing.
         """
-        if not self.context.fitted_to(demonstrations):
+        self.context.fit(demonstrations)
+        if self._written is not self.context.trajectories_:  # another method may have fitted the context before
             self._heard = None
-            self.context.fit(demonstrations)
             self.prompt.fit(self.context.keypoints_, self.context.trajectories_)
+            self._written = self.context.trajectories_
         return self
 
     def propose(self, observation: Observation, num_queries: int) -> Proposal:
