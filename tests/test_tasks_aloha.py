@@ -15,7 +15,7 @@ from robust_instant_policy.tasks import make_task
 from robust_instant_policy.trajectory import Trajectory, downsample
 
 SEEDS = (0, 1)
-MOVING_PART = {"aloha-pick-banana": "banana"}
+MOVING_PART = {"aloha-pick-banana": "banana", "aloha-cup-upright": "cup", "aloha-pick-place": "bottle"}
 ENVIRONMENTS = ("RIP-AlohaPickBanana-v1",)
 VISIBLE_PIXELS = 200
 REST_SECONDS = 60.0

@@ -27,7 +27,7 @@ class Family:
 
 FAMILIES = (
     Family("maniskill", "sim", "", ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")),
-    Family("aloha", "aloha", "aloha-", ("aloha-pick-banana",)),
+    Family("aloha", "aloha", "aloha-", ("aloha-pick-banana", "aloha-pick-place", "aloha-cup-upright")),
 )
 TASK_NAMES = tuple(name for family in FAMILIES for name in family.names)
 

@@ -33,17 +33,28 @@ class Kinematics:
     """An arm whose first ``num_joints`` joints, in the order of ``model``, move the frame ``tool``.
 
     ``tool`` names a ``kind`` ("body" or "site") of the model; ``base (4, 4)`` is where the model's origin stands in
-    the world.
+    the world. ``orientation_cost`` says how many metres off a tool turned by a radian counts as. With a
+    ``reluctance``, in the same unit, joints rather stay where they are: close to a singular pose the tool is then
+    turned a little less than asked for, where without it a joint would swing round.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, tool: str, kind: Literal["body", "site"], num_joints: int, base: ArrayLike
+        self,
+        model: mujoco.MjModel,
+        tool: str,
+        kind: Literal["body", "site"],
+        num_joints: int,
+        base: ArrayLike,
+        reluctance: float = 0.0,
+        orientation_cost: float = ORIENTATION_COST,
     ):
         self._configuration = mink.Configuration(model)
         self._tool, self._kind, self.num_joints = tool, kind, num_joints
         self._task = mink.FrameTask(
-            tool, kind, position_cost=1.0, orientation_cost=ORIENTATION_COST, lm_damping=LEVENBERG_MARQUARDT
+            tool, kind, position_cost=1.0, orientation_cost=orientation_cost, lm_damping=LEVENBERG_MARQUARDT
         )
+        self._staying = mink.PostureTask(model, cost=reluctance)
+        self._tasks = [self._task, self._staying] if reluctance else [self._task]
         self._limits = [mink.ConfigurationLimit(model)]
         self._base = np.asarray(base, dtype=np.float64)
 
@@ -61,6 +72,7 @@ class Kinematics:
         errors = np.empty((len(poses), 2))
         for step, pose in enumerate(local):
             self._task.set_target(mink.SE3.from_matrix(pose))
+            self._staying.set_target(self._configuration.q)
             errors[step] = self._solve()
             joints[step] = self._configuration.q[: self.num_joints]
         return JointPath(joints, errors[:, 0], errors[:, 1])
@@ -77,7 +89,7 @@ class Kinematics:
             if (position < CONVERGED_M and rotation < CONVERGED_RAD) or iteration == MAX_ITERATIONS:
                 break
             velocity = mink.solve_ik(
-                self._configuration, [self._task], 1.0, "daqp", damping=DAMPING, limits=self._limits
+                self._configuration, self._tasks, 1.0, "daqp", damping=DAMPING, limits=self._limits
             )
             self._configuration.integrate_inplace(velocity, 1.0)
         return position, rotation

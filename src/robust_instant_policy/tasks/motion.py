@@ -24,7 +24,6 @@ SETTLE_SECONDS = 0.5  # at the last waypoint, before success is judged
 
 FLIP_RAD = 0.6  # a joint change between commands 20 ms apart that only a leap across a singularity makes
 REACH_TOLERANCE_M = 5e-3
-REACH_TOLERANCE_RAD = 0.05
 TABLE_TOLERANCE_M = 0.012  # fingertips commanded deeper than this into the table are refused
 TRIPLET_TOLERANCE_M = 0.05  # rms misfit beyond which three points are no gripper
 CLOSED = 0.5  # gripper states above this count as closed
@@ -35,7 +34,8 @@ class Arm:
     """What the executor has to know of an arm with a parallel gripper.
 
     ``home (J,)`` joint angles in rad; ``finger_travel`` of each finger from closed (0) to open, in metres, and
-    ``finger_speed``, m/s; ``joint_speed`` rad/s and ``tool_speed`` m/s are limits.
+    ``finger_speed``, m/s; ``joint_speed`` rad/s and ``tool_speed`` m/s are limits; ``turn_tolerance``, rad, is how far
+    the tool may be turned from what was asked for.
     """
 
     kinematics: Kinematics
@@ -45,6 +45,7 @@ class Arm:
     finger_speed: float
     joint_speed: float
     tool_speed: float
+    turn_tolerance: float
 
     @property
     def home_pose(self) -> FloatArray:
@@ -181,7 +182,7 @@ def plan_poses(
     steps = np.arange(len(poses)) if steps is None else steps
     path = arm.kinematics.follow(poses, before.joints[-1])
     _refuse(
-        (path.position_error > REACH_TOLERANCE_M) | (path.rotation_error > REACH_TOLERANCE_RAD),
+        (path.position_error > REACH_TOLERANCE_M) | (path.rotation_error > arm.turn_tolerance),
         "a pose the arm cannot reach, it stays {:.0f} mm short",
         path.position_error * 1e3,
         steps,

@@ -7,6 +7,8 @@ import gymnasium
 MAX_EPISODE_STEPS = 3000  # a minute
 ENVIRONMENTS = {
     "RIP-AlohaPickBanana-v1": "pick_banana:PickBananaEnv",
+    "RIP-AlohaPickPlace-v1": "pick_place:PickPlaceEnv",
+    "RIP-AlohaCupUpright-v1": "cup_upright:CupUprightEnv",
 }
 
 for name, entry_point in ENVIRONMENTS.items():

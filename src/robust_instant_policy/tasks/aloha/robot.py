@@ -37,7 +37,10 @@ PAD_FRICTION = 1.2  # grip tape
 PAD_TORSION_M, PAD_ROLLING_M = 0.01, 1e-3
 
 SERVO_TORQUE_NM = (10.6, 21.2, 21.2, 10.6, 10.6, 4.1)  # XM540-W270, two of them at shoulder and elbow, XM430-W350
-SERVO_SPEED_RAD_S = np.pi  # XM540-W270: 30 rev/min
+JOINT_SPEED_LIMIT_RAD_S = 0.8 * np.pi  # XM540-W270: 30 rev/min without load
+TOOL_SPEED_LIMIT_M_S = 0.6
+TURN_TOLERANCE_RAD = 0.1  # where hand and forearm come into line, which is in the middle of this arm's range
+RELUCTANCE_M, ORIENTATION_COST_M = 0.008, 0.05
 STIFFNESS = (300.0, 500.0, 400.0, 60.0, 60.0, 30.0)  # N m/rad: 5 mm into the table press with some 10 N
 LAG_S = 0.03
 ARMATURE = 0.02  # kg m², the rotors' inertia seen through their gears
@@ -134,15 +137,18 @@ def working_arm() -> Arm:
     for name in list(spec.actuators) + list(spec.equalities):
         spec.delete(name)
     spec.delete(spec.body(PARKED))
-    kinematics = Kinematics(spec.compile(), f"{WORKING}/{TOOL}", "site", len(ARM_JOINTS), np.eye(4))
+    kinematics = Kinematics(
+        spec.compile(), f"{WORKING}/{TOOL}", "site", len(ARM_JOINTS), np.eye(4), RELUCTANCE_M, ORIENTATION_COST_M
+    )
     return Arm(
         kinematics=kinematics,
         home=np.array(HOME_JOINTS),
         triangle=TRIANGLE,
         finger_travel=FINGER_TRAVEL_M,
         finger_speed=FINGER_SPEED_M_S,
-        joint_speed=0.8 * SERVO_SPEED_RAD_S,
-        tool_speed=0.6,
+        joint_speed=JOINT_SPEED_LIMIT_RAD_S,
+        tool_speed=TOOL_SPEED_LIMIT_M_S,
+        turn_tolerance=TURN_TOLERANCE_RAD,
     )
 
 

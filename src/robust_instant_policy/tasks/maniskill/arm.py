@@ -23,6 +23,8 @@ EXECUTE_HZ = 5.5  # "executed at 5.5 Hz" (Oh et al. 2025, Sec. V-A)
 JOINT_SPEED_LIMIT_RAD_S = 0.8 * np.pi  # the joints' 180 degrees/s, with a margin for tracking
 TOOL_SPEED_LIMIT_M_S = 1.0  # "typical TCP speed 1 m/s" (UR5e data sheet)
 
+TURN_TOLERANCE_RAD = 0.05
+
 
 def ur5e_kinematics(base_position: ArrayLike) -> Kinematics:
     """The arm standing at ``base_position (3,)`` metres, its base unturned."""
@@ -41,4 +43,5 @@ def ur5e_hande() -> Arm:
         finger_speed=FINGER_SPEED_M_S,
         joint_speed=JOINT_SPEED_LIMIT_RAD_S,
         tool_speed=TOOL_SPEED_LIMIT_M_S,
+        turn_tolerance=TURN_TOLERANCE_RAD,
     )

@@ -1,0 +1,115 @@
+"""Take a lying cup and stand it upright."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from robust_instant_policy.geometry import FloatArray, make_pose
+from robust_instant_policy.tasks.aloha.cell import AlohaEnv
+from robust_instant_policy.tasks.aloha.cup import Cup
+from robust_instant_policy.tasks.aloha.robot import BASE_X_M
+from robust_instant_policy.tasks.demonstrator import Stroke
+from robust_instant_policy.tasks.poses import facing, pitched
+from robust_instant_policy.tasks.simulated_task import TaskSpec
+
+X_RANGE_M, Y_RANGE_M = (-0.14, -0.02), (-0.13, 0.13)
+YAW_RANGE_RAD = np.deg2rad(30)
+
+UPRIGHT_RAD = np.deg2rad(8)
+
+PITCH_RAD = np.deg2rad(-15)  # of the hand when it comes down: turned by 90 degrees it still clears the table
+HOLD_SHARE = 0.5  # of the cup's height
+BEYOND_M = 0.012  # fingertips past the cup's axis
+APPROACH_M = 0.08
+FORWARD_M = 0.09  # from where the cup's middle lay to where it stands
+LIFT_M = 0.05
+TURN_FIRST_RAD = np.deg2rad(20)  # that the hand is raised by while it is lifted
+OVER_M = 0.02  # of the cup's foot over the table before it is set down
+SET_DOWN_M = 0.003  # of its foot over the table when it is let go
+
+
+class CupUprightEnv(AlohaEnv):
+    """Success: the cup stands on the table on its foot, let go of and at rest."""
+
+    cup: Cup
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        self.cup = Cup.draw(self.draw("shape"))
+        rng = self.draw("pose")
+        yaw = rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD)
+        self.cup.build(spec, "cup", facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), yaw) @ self.cup.lying())
+
+    def evaluate(self) -> dict[str, Any]:
+        lean = float(np.arccos(np.clip(self.pose_of("cup")[2, 2], -1, 1)))
+        stands = lean < UPRIGHT_RAD and self.touch("cup", "world") > 0
+        let_go = not self.is_held("cup")
+        return {"success": stands and let_go and self.is_still("cup"), "lean": lean, "let_go": let_go}
+
+
+def stand_up(env: CupUprightEnv, rng: np.random.Generator) -> list[Stroke]:
+    """Hold the cup across its middle, turn it mouth up on the way forward, set it down, let go and draw back."""
+    lying = env.pose_of("cup")
+    axis = lying[:3, 2]
+    yaw, rise = float(np.arctan2(axis[1], axis[0])), float(np.arcsin(axis[2]))
+    middle = lying[:3, 3] + HOLD_SHARE * env.cup.height * axis
+    hold = _grip(middle, PITCH_RAD, yaw)
+    # A hand in line with its forearm turns up without effort; at an angle to it, the forearm would have to roll over.
+    lifted = _grip(_over(middle, LIFT_M), PITCH_RAD + TURN_FIRST_RAD, _bearing(middle))
+    upright = PITCH_RAD + np.pi / 2 - rise
+    stand = middle + FORWARD_M * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    stand[2] = SET_DOWN_M + HOLD_SHARE * env.cup.height
+    over = _grip(_over(stand, OVER_M), upright, _bearing(stand))
+    end = _grip(stand, upright, _bearing(stand))
+    return [
+        Stroke(_back(hold, APPROACH_M)[None], closed=False, free=True, speed=0.20, error=0.003),
+        Stroke(hold[None], closed=True, speed=0.08, error=0.0015),
+        Stroke(np.array([lifted, over]), closed=True, speed=0.14, error=0.003, pause=0.2),
+        Stroke(end[None], closed=False, speed=0.05, error=0.001, pause=0.3),
+        Stroke(_back(end, APPROACH_M)[None], closed=False, speed=0.10, error=0.002),
+    ]
+
+
+def _grip(middle: FloatArray, pitch: float, yaw: float) -> FloatArray:
+    """Tool pose ``(4, 4)`` of a hand whose fingers reach a little past the cup's ``middle (3,)``."""
+    hand = pitched(pitch, yaw)
+    return make_pose(hand, middle + BEYOND_M * hand[:, 2])
+
+
+def _over(point: FloatArray, height: float) -> FloatArray:
+    """``point (3,)`` raised by ``height`` metres."""
+    return point + np.array([0.0, 0.0, height])
+
+
+def _bearing(point: FloatArray) -> float:
+    """Direction, in rad, in which the working arm sees ``point (3,)``."""
+    return float(np.arctan2(point[1], point[0] + BASE_X_M))
+
+
+def _back(pose: FloatArray, distance: float) -> FloatArray:
+    """``pose`` drawn back along its approach, in metres."""
+    return make_pose(pose[:3, :3], pose[:3, 3] - distance * pose[:3, 2])
+
+
+def verdict(env: CupUprightEnv) -> str:
+    """Why the task failed, or nothing."""
+    state = env.evaluate()
+    if state["success"]:
+        return ""
+    if not state["let_go"]:
+        return "the cup is still in the fingers"
+    if state["lean"] < UPRIGHT_RAD:
+        return "the cup is upright but not at rest on the table"
+    return f"the cup leans by {np.rad2deg(state['lean']):.0f} degrees"
+
+
+SPEC = TaskSpec(
+    name="aloha-cup-upright",
+    description="stand the lying cup upright",
+    goal="the cup stands upright on the table",
+    env_id="RIP-AlohaCupUpright-v1",
+    expert=stand_up,
+    verdict=verdict,
+)
