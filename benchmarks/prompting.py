@@ -1,303 +1,327 @@
 """How well, how fast and for how many tokens a language model imitates, by frames and layout of the prompt.
 
-A synthetic pick-and-place: two objects, each turned and placed at random, five keypoints on each, measured with
-noise; the gripper grasps the first object in its own frame and sets it down in the frame of the second. Ten
-demonstrations, then scenes that were not shown. The error is the largest distance of any of the three gripper points
-from where it belongs, at any key step: start, both sides of the grasp and of the release, end.
+Ten demonstrations of a made-up task (`pick_and_place.py`), then scenes that were not shown. Every plan is kept in
+`results/prompting.jsonl` as it is made and not made again, so a run may be stopped and gone on with; the table is
+written anew from all that is kept, with the number of scenes of each row.
 
-    python benchmarks/prompting.py --nearest-last --out docs/tables/prompting.md
+    python benchmarks/prompting.py                                      # the embedded model, the paper's layout and ours
+    python benchmarks/prompting.py --layouts factorised --temperatures 0.5 1.0 --tasks place midway
+    python benchmarks/prompting.py --models gguf:qwen.gguf --layouts sequence --scenes 1 --deadline 1500
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import resource
 import time
 from collections import Counter
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Sequence
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 import numpy as np
+from pick_and_place import TASKS, WITHIN_M, PickAndPlace, Scene, key_error
 
 from robust_instant_policy.context import InContextPrompt
 from robust_instant_policy.context.prompt import Frames, Layout, Order
-from robust_instant_policy.geometry import FloatArray, GripperTriangle, interpolate_poses, make_pose
-from robust_instant_policy.llm import connect
+from robust_instant_policy.errors import ModelError
+from robust_instant_policy.llm import LanguageModel, connect
+from robust_instant_policy.query import Query
 from robust_instant_policy.regression import robust_gripper_trajectory
-from robust_instant_policy.trajectory import Trajectory, downsample
+from robust_instant_policy.trajectory import Trajectory
 
+ROOT = Path(__file__).parents[1]
+KEPT, TABLE = ROOT / "results" / "prompting.jsonl", ROOT / "docs" / "tables" / "prompting.md"
 NUM_DEMOS = 10
+NUM_SAMPLES = 5  # Q
 MIN_CANDIDATES = 3
-TRIANGLE = GripperTriangle(length=0.10, opening=0.08)
-KEYPOINT_NOISE_M = 0.002
-HAND_NOISE_M = 0.002  # of a demonstrator's waypoints
-HAND_NOISE_RAD = np.radians(2.0)
-WITHIN_M = 0.015
-HOME = make_pose(np.diag([1.0, -1.0, -1.0]), [0.30, 0.0, 0.35])
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Measured keypoints ``(K, 3)`` and what a demonstrator does in it."""
-
-    keypoints: FloatArray
-    trajectory: Trajectory
-
-
-class PickAndPlace:
-    """Draws scenes. The objects' keypoints and the grasp are those of ``seed``."""
-
-    def __init__(self, seed: int = 0):
-        rng = np.random.default_rng(seed)
-        self.shapes = rng.uniform([-0.04, -0.04, 0.0], [0.04, 0.04, 0.03], (2, 5, 3))
-        self.grasp = _down(rng.uniform(-0.01, 0.01, 2), 0.02, rng.uniform(-0.5, 0.5))
-        self.place = _down(rng.uniform(-0.01, 0.01, 2), 0.05, rng.uniform(-0.5, 0.5))
-
-    def scene(self, seed: int, *, exact: bool = False) -> Scene:
-        """Scene of ``seed``; ``exact`` lets the demonstrator's hand be steady (the keypoints stay noisy)."""
-        rng = np.random.default_rng([7, seed])
-        while True:
-            places = rng.uniform([0.35, -0.25], [0.65, 0.25], (2, 2))
-            if np.linalg.norm(places[0] - places[1]) > 0.15:
-                break
-        objects = [_turned(place, angle) for place, angle in zip(places, rng.uniform(-1.5, 1.5, 2), strict=True)]
-        keypoints = np.concatenate(
-            [shape @ pose[:3, :3].T + pose[:3, 3] for shape, pose in zip(self.shapes, objects, strict=True)]
-        )
-        keypoints = keypoints + rng.normal(0, KEYPOINT_NOISE_M, keypoints.shape)
-        grasp, place = objects[0] @ self.grasp, objects[1] @ self.place
-        if not exact:
-            grasp, place = _shaken(grasp, rng), _shaken(place, rng)
-        ways = [
-            (HOME, 0),
-            (_raised(grasp, 0.10), 0),
-            (grasp, 0),
-            (grasp, 1),
-            (_raised(grasp, 0.12), 1),
-            (_raised(place, 0.12), 1),
-            (place, 1),
-            (place, 0),
-            (_raised(place, 0.12), 0),
-        ]
-        return Scene(keypoints, downsample(_played(ways, rng)))
-
-
-def _played(ways: list[tuple[FloatArray, int]], rng: np.random.Generator) -> Trajectory:
-    poses, states = [ways[0][0][None]], [np.array([ways[0][1]])]
-    for (start, _), (stop, state) in pairwise(ways):
-        count = max(2, round(np.linalg.norm(stop[:3, 3] - start[:3, 3]) / 0.005 * rng.uniform(0.8, 1.25)))
-        poses.append(interpolate_poses([0, 1], np.stack([start, stop]), np.arange(1, count + 1) / count))
-        states.append(np.full(count, state))
-    return Trajectory.from_poses(np.concatenate(poses), np.concatenate(states), TRIANGLE)
-
-
-def _turned(place: FloatArray, angle: float) -> FloatArray:
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return make_pose([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]], [*place, 0])
-
-
-def _down(place: FloatArray, height: float, angle: float) -> FloatArray:
-    return make_pose(_turned(place, angle)[:3, :3] @ np.diag([1.0, -1.0, -1.0]), [*place, height])
-
-
-def _raised(pose: FloatArray, height: float) -> FloatArray:
-    return make_pose(pose[:3, :3], pose[:3, 3] + [0, 0, height])
-
-
-def _shaken(pose: FloatArray, rng: np.random.Generator) -> FloatArray:
-    turn = _turned(np.zeros(2), rng.normal(0, HAND_NOISE_RAD))[:3, :3]
-    return make_pose(turn @ pose[:3, :3], pose[:3, 3] + rng.normal(0, HAND_NOISE_M, 3))
-
-
-def key_steps(trajectory: Trajectory) -> list[int]:
-    """The start, both sides of every gripper change, and the end."""
-    changes = np.flatnonzero(np.diff(np.round(trajectory.gripper_state[:, 0])))
-    return [0, *(int(step) + side for step in changes for side in (0, 1)), len(trajectory) - 1]
-
-
-def key_error(trajectory: Trajectory, truth: Trajectory) -> float:
-    """Largest distance of the three gripper points from the truth at any key step, metres; infinite when the
-    gripper opens and closes another number of times."""
-    own, true = key_steps(trajectory), key_steps(truth)
-    if len(own) != len(true):
-        return float("inf")
-    return float(np.linalg.norm(trajectory.triplets[own] - truth.triplets[true], axis=-1).max())
+DOF = 1.5
+FIRST_NEW_SEED = 1000  # demonstrations count from 0
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table: a way of asking."""
+    """One line of the table: a task and a way of asking."""
 
+    task: str
     model: str
     frames: Frames
     layout: Layout
-    order: Order = "given"
+    order: Order
+    temperature: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Outcome:
-    """Key-step errors in metres (infinite where no plan came) and what the plans cost."""
+    """One plan: key-step errors in metres (infinite where nothing came) and what it cost.
 
-    single: FloatArray
-    gaussian: FloatArray
-    robust: FloatArray
+    ``tokens`` are those read (not from a cache) and written, ``paper_tokens`` those of the paper's layout for the
+    same numbers; ``cold`` says that the model had read nothing before. ``load`` is the machine's, from other work,
+    and ``peak_gib`` the memory of the whole process so far.
+    """
+
+    scene: int
+    cold: bool
+    single: tuple[float, ...]
+    gaussian: float
+    robust: float
     refused: int
     answers: int
-    tokens: list[int]  # read (not from a cache) and written, of each plan
-    seconds: list[float]
-    cpu_seconds: list[float]
+    tokens: int
+    paper_tokens: int
+    seconds: float
+    cpu_seconds: float
+    load_seconds: float
+    peak_gib: float
+    load: float
 
 
-def measure(row: Row, world: PickAndPlace, scenes: int, args: argparse.Namespace) -> Outcome:
-    demos = [world.scene(seed) for seed in range(NUM_DEMOS)]
-    prompt = InContextPrompt(row.frames, row.layout, row.order)
-    prompt.fit(np.stack([demo.keypoints for demo in demos]), [demo.trajectory for demo in demos])
-    model = connect(row.model)
-    counts: Counter[bool] = Counter()
-    single, gaussian, robust = [], [], []
-    tokens, seconds, cpu_seconds = [], [], []
-    for number in range(scenes):
-        scene = world.scene(1000 + number, exact=True)
+class Measurement:
+    """Plans of one row, made with one model in one process."""
+
+    def __init__(self, row: Row, model: LanguageModel, load_seconds: float, deadline_s: float):
+        self._row, self._model, self._load_seconds, self._deadline_s = row, model, load_seconds, deadline_s
+        self._world = PickAndPlace(row.task)
+        demos = [self._world.scene(seed) for seed in range(NUM_DEMOS)]
+        self._prompt = fitted(demos, row.frames, row.layout, row.order)
+        self._paper = fitted(demos, "world", "sequence", "given")
+        self._cold = True
+
+    def plan(self, number: int) -> Outcome:
+        scene = self._world.scene(FIRST_NEW_SEED + number, exact=True)
+        counts: Counter[bool] = Counter()
+        load = os.getloadavg()[0]
         start, cpu = time.monotonic(), time.process_time()
-        answers = model.sample(
-            prompt.queries(scene.keypoints),
-            args.samples,
-            temperature=args.temperature,
+        answers = self._model.sample(
+            self._prompt.queries(scene.keypoints),
+            NUM_SAMPLES,
+            temperature=self._row.temperature,
             seed=number,
-            deadline_s=args.deadline,
-            accept=prompt.accepts,
+            deadline_s=self._deadline_s,
+            accept=self._prompt.accepts,
             on_answer=lambda query, sample, attempt, answer, accepted: counts.update([accepted]),
         )
-        seconds.append(time.monotonic() - start)
-        cpu_seconds.append(time.process_time() - cpu)
+        seconds, cpu_seconds = time.monotonic() - start, time.process_time() - cpu
         every = [answer for own in answers for answer in own]
-        tokens.append(sum(one.prompt_tokens - one.cached_tokens + one.completion_tokens for one in every))
         candidates = [
-            prompt.trajectory([own[index].text for own in answers], scene.keypoints)
+            self._prompt.trajectory([own[index].text for own in answers], scene.keypoints)
             for index in range(min(map(len, answers)))
         ]
-        single += [key_error(candidate, scene.trajectory) for candidate in candidates]
-        single += [float("inf")] * (args.samples - len(candidates))
-        for results, dof in ((gaussian, float("inf")), (robust, 1.5)):
-            if len(candidates) < MIN_CANDIDATES:
-                results.append(float("inf"))
-            else:
-                fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof)
-                results.append(key_error(Trajectory.from_actions(fit.actions), scene.trajectory))
+        single = [key_error(candidate, scene.trajectory) for candidate in candidates]
+        outcome = Outcome(
+            scene=number,
+            cold=self._cold,
+            single=(*single, *[float("inf")] * (NUM_SAMPLES - len(single))),
+            gaussian=agreed_error(candidates, scene, float("inf")),
+            robust=agreed_error(candidates, scene, DOF),
+            refused=counts[False],
+            answers=counts.total(),
+            tokens=sum(one.prompt_tokens - one.cached_tokens + one.completion_tokens for one in every),
+            paper_tokens=self._paper_tokens(scene),
+            seconds=seconds,
+            cpu_seconds=cpu_seconds,
+            load_seconds=self._load_seconds,
+            peak_gib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+            load=load,
+        )
+        self._cold = False
+        return outcome
+
+    def _paper_tokens(self, scene: Scene) -> int:
+        """What a perfect plan would cost in the paper's layout, by this model's count of tokens."""
+        (query,) = self._paper.queries(scene.keypoints)
+        # Shown as one more demonstration, the right answer is the text between its keypoints and the end.
+        told = fitted([scene], "world", "sequence", "given").queries(scene.keypoints)[0].text
+        keypoints = query.text.splitlines()[-1] + "\n"
+        answer = told.removeprefix(keypoints).removesuffix(keypoints)
+        read = query.text if self._cold else keypoints
+        return self._model.count_tokens(read) + NUM_SAMPLES * self._model.count_tokens(answer)
+
+
+def fitted(demos: Sequence[Scene], frames: Frames, layout: Layout, order: Order) -> InContextPrompt:
+    prompt = InContextPrompt(frames, layout, order)
+    return prompt.fit(np.stack([demo.keypoints for demo in demos]), [demo.trajectory for demo in demos])
+
+
+def agreed_error(candidates: Sequence[Trajectory], scene: Scene, dof: float) -> float:
+    if len(candidates) < MIN_CANDIDATES:
+        return float("inf")
+    fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof)
+    return key_error(Trajectory.from_actions(fit.actions), scene.trajectory)
+
+
+def loaded(spec: str) -> tuple[LanguageModel, float]:
+    """The model, ready to answer, and the seconds that took."""
+    start = time.monotonic()
+    model = connect(spec)
+    model.sample([Query("1 2 3 ", max_tokens=1)], 1, temperature=0.0)
+    return model, time.monotonic() - start
+
+
+def read_kept() -> dict[Row, dict[int, Outcome] | str]:
+    """Plans by row and scene, or the words with which a model refused the prompt."""
+    kept: dict[Row, dict[int, Outcome] | str] = {}
+    for line in KEPT.read_text().splitlines() if KEPT.exists() else ():
+        entry = json.loads(line)
+        row = Row(**entry["row"])
+        if "refused" in entry:
+            kept[row] = entry["refused"]
+            continue
+        plans = kept.setdefault(row, {})
+        outcome = Outcome(**entry["plan"] | {"single": tuple(entry["plan"]["single"])})
+        assert isinstance(plans, dict)
+        plans[outcome.scene] = outcome
+    return kept
+
+
+def keep(row: Row, entry: dict[str, object]) -> None:
+    KEPT.parent.mkdir(parents=True, exist_ok=True)
+    with KEPT.open("a") as file:
+        file.write(json.dumps({"row": asdict(row), **entry}) + "\n")
+
+
+def measure(row: Row, spec: str, scenes: int, deadline_s: float) -> None:
+    """Make the plans of ``row`` that are missing."""
+    done = read_kept().get(row, {})
+    missing = [number for number in range(scenes) if number not in done] if isinstance(done, dict) else []
+    if not missing:
+        return
+    model, load_seconds = loaded(spec)
+    measurement = Measurement(row, model, load_seconds, deadline_s)
+    for number in missing:
+        try:
+            outcome = measurement.plan(number)
+        except ModelError as error:
+            keep(row, {"refused": str(error)})
+            break
+        keep(row, {"plan": asdict(outcome)})
+        print(
+            f"{' '.join(map(str, astuple(row)))}, scene {number}: {1000 * outcome.robust:.1f} mm, "
+            f"{outcome.seconds:.1f} s, {outcome.cpu_seconds:.1f} s of processor",
+            flush=True,
+        )
     model.close()
-    return Outcome(
-        np.array(single),
-        np.array(gaussian),
-        np.array(robust),
-        counts[False],
-        counts.total(),
-        tokens,
-        seconds,
-        cpu_seconds,
-    )
-
-
-def as_line(row: Row, outcome: Outcome) -> str:
-    def cost(values: list[float], form: str) -> str:
-        later = f"{np.median(values[1:]):{form}}" if len(values) > 1 else "—"
-        return f"{values[0]:{form}} / {later}"
-
-    name = row.model if row.model == "embedded" else Path(row.model.removeprefix("gguf:")).stem
-    cells = (
-        name + (", nearest last" if row.order == "nearest-last" else ""),
-        f"{row.frames}, {row.layout}",
-        str(len(outcome.robust)),
-        _errors(outcome.single),
-        _errors(outcome.gaussian),
-        _errors(outcome.robust),
-        f"{outcome.refused / max(outcome.answers, 1):.0%}",
-        cost([float(value) for value in outcome.tokens], ".0f"),
-        cost(outcome.seconds, ".1f"),
-        cost(outcome.cpu_seconds, ".1f"),
-        f"{os.getloadavg()[2]:.1f} on {os.cpu_count()} cores",
-    )
-    return "| " + " | ".join(cells) + " |"
-
-
-def reference_line(world: PickAndPlace, scenes: int) -> str:
-    """What the frames give without any model: every number the demonstrations' median."""
-    demos = [world.scene(seed) for seed in range(NUM_DEMOS)]
-    prompt = InContextPrompt().fit(np.stack([demo.keypoints for demo in demos]), [demo.trajectory for demo in demos])
-    errors = []
-    for number in range(scenes):
-        scene = world.scene(1000 + number, exact=True)
-        errors.append(key_error(prompt.median_trajectory(scene.keypoints), scene.trajectory))
-    cells = ("none: the demonstrations' median", "adaptive, factorised", str(scenes), _errors(np.array(errors)))
-    return "| " + " | ".join([*cells, *[""] * (len(COLUMNS) - len(cells))]) + " |"
-
-
-def _errors(values: FloatArray) -> str:
-    median = float(np.median(values)) * 1000
-    return f"{'—' if np.isinf(median) else f'{median:.1f}'} mm, {np.mean(values <= WITHIN_M):.0%}"
 
 
 COLUMNS = (
+    "task",
     "model",
     "frames, layout",
+    "temperature",
     "scenes",
     "single sample",
     "Gaussian mean",
     "Student's t",
     "unparsable",
     "tokens a plan, first / later",
-    "seconds, first / later",
-    "CPU seconds, first / later",
-    "load of the machine",
+    "of the paper's layout",
+    "seconds",
+    "CPU seconds",
+    "load",
 )
-HEADER = "| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS) + "\n"
+
+
+def as_cells(row: Row, plans: Sequence[Outcome]) -> list[str]:
+    first, later = [[plan for plan in plans if plan.cold is cold] for cold in (True, False)]
+
+    def both(form: str, name: str, share_of: str | None = None) -> str:
+        return " / ".join(
+            format(np.median([getattr(p, name) / (getattr(p, share_of) if share_of else 1) for p in own]), form)
+            if own
+            else "—"
+            for own in (first, later)
+        )
+
+    return [
+        row.task,
+        row.model + (", nearest last" if row.order == "nearest-last" else ""),
+        f"{row.frames}, {row.layout}",
+        f"{row.temperature:g}",
+        str(len(plans)),
+        _errors([error for plan in plans for error in plan.single]),
+        _errors([plan.gaussian for plan in plans]),
+        _errors([plan.robust for plan in plans]),
+        f"{sum(plan.refused for plan in plans) / max(sum(plan.answers for plan in plans), 1):.0%}",
+        both(".0f", "tokens"),
+        both(".2f", "tokens", "paper_tokens"),
+        both(".1f", "seconds"),
+        both(".1f", "cpu_seconds"),
+        f"{np.median([plan.load for plan in plans]):.1f}",
+    ]
+
+
+def reference_cells(task: str, scenes: int) -> list[str]:
+    """What the frames give without any model: every number the demonstrations' median."""
+    world = PickAndPlace(task)
+    prompt = fitted([world.scene(seed) for seed in range(NUM_DEMOS)], "adaptive", "factorised", "given")
+    new = [world.scene(FIRST_NEW_SEED + number, exact=True) for number in range(scenes)]
+    errors = [key_error(prompt.median_trajectory(scene.keypoints), scene.trajectory) for scene in new]
+    return [task, "none: the median", "adaptive, factorised", "—", str(scenes), "—", "—", _errors(errors), *["—"] * 6]
+
+
+def _errors(values: Sequence[float]) -> str:
+    median = float(np.median(values)) * 1000
+    return f"{'—' if np.isinf(median) else f'{median:.1f}'} mm, {np.mean(np.array(values) <= WITHIN_M):.0%}"
+
+
+def table() -> str:
+    kept = read_kept()
+    lines = [COLUMNS, ["---"] * len(COLUMNS)]
+    remarks = []
+    for task in dict.fromkeys(row.task for row in kept):
+        lines.append(reference_cells(task, 20))
+        for row, plans in sorted(kept.items(), key=lambda item: astuple(item[0])):
+            if row.task != task:
+                continue
+            if isinstance(plans, str):
+                remarks.append(f"{row.model}, {row.frames}, {row.layout}: {plans}.")
+            else:
+                lines.append(as_cells(row, [plans[number] for number in sorted(plans)]))
+    made = [plan for plans in kept.values() if isinstance(plans, dict) for plan in plans.values()]
+    embedded = [p for row, plans in kept.items() if row.model == "embedded" and isinstance(plans, dict)
+                for p in plans.values() if row.layout == "factorised"]  # fmt: skip
+    if embedded:
+        remarks.append(
+            f"The embedded model was ready in {min(p.load_seconds for p in embedded):.1f} to "
+            f"{max(p.load_seconds for p in embedded):.1f} s; the whole process needed at most "
+            f"{max(p.peak_gib for p in embedded):.2f} GiB."
+        )
+    head = (
+        f"Written by `benchmarks/prompting.py` from {len(made)} plans, {NUM_DEMOS} demonstrations each, Q = {NUM_SAMPLES}, "
+        f"on {os.cpu_count()} cores.\n\n"
+    )
+    body = "".join("| " + " | ".join(cells) + " |\n" for cells in lines)
+    return head + body + "".join(f"\n{remark}\n" for remark in remarks)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--models", nargs="+", default=["embedded"], help="as for rip.connect")
-    parser.add_argument("--frames", nargs="+", default=["world", "adaptive"])
-    parser.add_argument("--layouts", nargs="+", default=["sequence", "factorised"])
-    parser.add_argument("--nearest-last", action="store_true", help="also with the nearest demonstration last")
+    parser.add_argument("--models", nargs="*", default=["embedded"], help="as for rip.connect; none: only the table")
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=["place"])
+    parser.add_argument("--frames", nargs="+", choices=("world", "adaptive"), default=["world", "adaptive"])
+    parser.add_argument("--layouts", nargs="+", choices=("sequence", "factorised"), default=["sequence", "factorised"])
+    parser.add_argument("--orders", nargs="+", choices=("given", "nearest-last"), default=["given"])
+    parser.add_argument("--temperatures", nargs="+", type=float, default=[0.7])
     parser.add_argument("--scenes", type=int, default=20)
-    parser.add_argument("--sequence-scenes", type=int, default=3, help="sequences take a minute or more a plan")
-    parser.add_argument("--samples", type=int, default=5)
-    parser.add_argument("--temperature", type=float, default=0.5)
+    parser.add_argument("--sequence-scenes", type=int, default=3, help="sequences take minutes a plan")
     parser.add_argument("--deadline", type=float, default=300.0, help="seconds a plan")
-    parser.add_argument("--world", type=int, default=0, help="seed of the objects")
-    parser.add_argument("--out", type=Path, help="also write the table there")
+    parser.add_argument("--out", type=Path, default=TABLE, help="the table")
     args = parser.parse_args()
-    world = PickAndPlace(args.world)
-    lines = [reference_line(world, args.scenes)]
-    orders: list[Order] = ["given", "nearest-last"] if args.nearest_last else ["given"]
-    for name in args.models:
-        for layout in args.layouts:
-            for frames in args.frames:
-                for order in orders:
-                    row = Row(name, frames, layout, order)
-                    scenes = args.sequence_scenes if layout == "sequence" else args.scenes
-                    lines.append(as_line(row, measure(row, world, scenes, args)))
-                    print(lines[-1], flush=True)
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        lines = merged(args.out.read_text().splitlines() if args.out.exists() else [], lines)
-    table = (
-        "Written by `benchmarks/prompting.py`, a row at a time. "
-        f"{NUM_DEMOS} demonstrations, Q = {args.samples}, temperature {args.temperature:g}.\n\n"
-        + HEADER
-        + "\n".join(lines)
-        + "\n"
-    )
-    print("\n" + table)
-    if args.out is not None:
-        args.out.write_text(table)
-
-
-def merged(old: list[str], new: list[str]) -> list[str]:
-    """Rows of earlier runs that were not measured again, and the new ones."""
-    names = [line.split("|")[1:3] for line in new]
-    rows = [line for line in old if line.startswith("| ") and line.split("|")[1:3] not in names]
-    return sorted([*(row for row in rows if row not in HEADER and not row.startswith("| ---")), *new])
+    for spec in args.models:
+        name = Path(spec.removeprefix("gguf:")).stem
+        for task in args.tasks:
+            for layout in args.layouts:
+                for frames in args.frames:
+                    for order in args.orders:
+                        for temperature in args.temperatures:
+                            row = Row(task, name, frames, layout, order, temperature)
+                            scenes = args.sequence_scenes if layout == "sequence" else args.scenes
+                            measure(row, spec, scenes, args.deadline)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(table())
+    print(args.out.read_text())
 
 
 if __name__ == "__main__":
