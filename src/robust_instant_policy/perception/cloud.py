@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import label, maximum_filter, uniform_filter
 
 from robust_instant_policy.demonstration import Observation
@@ -21,7 +22,7 @@ LIFTED_DEVIATIONS = 4.0  # or this many deviations of the depth's noise, if that
 STRANGE = 4.0  # deviations from the table's colour that the surroundings of a flat point need
 STRANGE_ITSELF = 2.5  # and the point itself, so that objects have no halo
 SMOOTH_PX = 5  # size of those surroundings; evens out the grain of the table
-COLOUR_SAMPLES = 4000
+COLOUR_SAMPLES = 1000
 PIECE_GAP_M = 0.02  # foreground points further apart in the image belong to different objects
 MIN_PIECE = 15  # points; less is noise
 
@@ -72,14 +73,12 @@ def foreground(
     noise = 1.4826 * np.median(np.abs(above[np.abs(above) < LIFTED_M])) if (np.abs(above) < LIFTED_M).any() else 0.0
     lifted = above > max(LIFTED_M, LIFTED_DEVIATIONS * noise)
     cells = descriptors.cells_at(pixels)
-    colours = observation.rgb[pixels[:, 1], pixels[:, 0]] / np.float32(255)
-    table = TableColour(colours[~lifted][:: max(1, len(colours) // COLOUR_SAMPLES)] if not lifted.all() else colours)
+    flat = pixels[~lifted] if not lifted.all() else pixels
+    table = TableColour(_colours(observation.rgb, flat[:: max(1, len(flat) // COLOUR_SAMPLES)]))
     candidates = np.flatnonzero(~lifted & (descriptors.saliency.reshape(-1)[cells] > salient))
-    smooth = uniform_filter(observation.rgb, size=(SMOOTH_PX, SMOOTH_PX, 1))[
-        pixels[candidates, 1], pixels[candidates, 0]
-    ]
-    strange = (table.strangeness(smooth / np.float32(255)) > STRANGE) & (
-        table.strangeness(colours[candidates]) > STRANGE_ITSELF
+    smooth = _colours(uniform_filter(observation.rgb, size=(SMOOTH_PX, SMOOTH_PX, 1)), pixels[candidates])
+    strange = (table.strangeness(smooth) > STRANGE) & (
+        table.strangeness(_colours(observation.rgb, pixels[candidates])) > STRANGE_ITSELF
     )
     chosen = lifted
     chosen[candidates[strange]] = True
@@ -94,4 +93,10 @@ def foreground(
     pieces = label(maximum_filter(mask, size=max(1, round(gap))), structure=np.ones((3, 3)))[0][place]
     large = np.bincount(pieces, minlength=1)[pieces] >= MIN_PIECE
     kept, pieces = kept[large], pieces[large]
-    return Cloud(points[kept], colours[kept], pixels[kept], cells[kept], pieces, depth), note
+    colours = _colours(observation.rgb, pixels[kept])
+    return Cloud(points[kept], colours, pixels[kept], cells[kept], pieces, depth), note
+
+
+def _colours(rgb: NDArray[np.uint8], pixels: IntArray) -> Float32Array:
+    """Colours ``(N, 3)`` in [0, 1] at ``pixels (N, 2)``."""
+    return rgb[pixels[:, 1], pixels[:, 0]] / np.float32(255)

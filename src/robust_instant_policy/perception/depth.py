@@ -52,16 +52,18 @@ def surface_depth(depth: NDArray[np.float32], pixels: ArrayLike, radius: int = 2
     windows = np.where(inside, depth[rows.clip(0, height - 1), cols.clip(0, width - 1)], np.nan)
     windows = windows.reshape(len(centre), -1)
     middle = windows[:, windows.shape[1] // 2]
-    result = np.full(len(centre), np.nan)
-    for index, (window, value) in enumerate(zip(windows, middle, strict=True)):
-        readings = np.sort(window[np.isfinite(window)])
-        if len(readings) < MIN_SUPPORT:
-            continue
-        jumps = np.flatnonzero(np.diff(readings) > SURFACE_TOLERANCE * readings[:-1]) + 1
-        surfaces = [part for part in np.split(readings, jumps) if len(part) >= MIN_SUPPORT]
-        if not surfaces:
-            continue
-        own = [part for part in surfaces if part[0] <= value <= part[-1]]
-        surface = own[0] if own else max(surfaces, key=len)
-        result[index] = (surface[(len(surface) - 1) // 2] + surface[len(surface) // 2]) / 2  # its median
-    return result
+    readings = np.sort(windows, axis=1)  # missing ones last
+    jump = np.diff(readings, axis=1) > SURFACE_TOLERANCE * readings[:, :-1]
+    surface = np.zeros(readings.shape, dtype=np.intp)  # number of the surface that a reading belongs to
+    surface[:, 1:] = jump.cumsum(axis=1)
+    numbers = surface + np.arange(len(readings))[:, None] * readings.shape[1]
+    size = np.bincount(numbers[np.isfinite(readings)], minlength=readings.size).reshape(readings.shape)
+    # A missing centre is compared false throughout, so it belongs to no surface.
+    own = np.take_along_axis(surface, (readings < middle[:, None]).sum(axis=1).clip(max=size.shape[1] - 1)[:, None], 1)
+    own_counts = np.isfinite(middle)[:, None] & (np.take_along_axis(size, own, axis=1) >= MIN_SUPPORT)
+    chosen = np.where(own_counts, own, size.argmax(axis=1)[:, None])
+    count = np.take_along_axis(size, chosen, axis=1)
+    first = (surface < chosen).sum(axis=1)[:, None]
+    lower = np.take_along_axis(readings, first + (count - 1).clip(0) // 2, axis=1)
+    upper = np.take_along_axis(readings, (first + count // 2).clip(max=size.shape[1] - 1), axis=1)
+    return np.where(count >= MIN_SUPPORT, (lower.astype(np.float64) + upper) / 2, np.nan)[:, 0]

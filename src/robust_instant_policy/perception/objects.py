@@ -18,7 +18,6 @@ MAX_OBJECT_POINTS = 250
 MAX_PIECE_POINTS = 500
 MAX_OBJECT_CELLS = 80
 SAME_OBJECT_M = 0.025  # points of an image this near to where the object was found belong to it
-TEMPLATES_TRIED = 2
 BEST_VIEWS = 3  # demonstrations whose descriptors judge a motion
 BUDDY_PATCHES = 2.0  # distance from its place within which a best buddy is one
 
@@ -115,15 +114,13 @@ class MovingObject:
         motions = proposals(
             np.concatenate([template.points for template in self.templates]),
             view.cell_points,
-            np.concatenate(similar)[:, :inside].astype(np.float64),
+            np.concatenate(similar)[:, :inside],
         )
-        found = []
-        for index in np.argsort(-likeness, kind="stable")[:TEMPLATES_TRIED]:
-            pose, fit, agreement = polish(
-                motions, self.templates[index].painted, view.painted, lambda m: self._agreements(m, view, similar)
-            )
-            found.append(Registration(pose, fit, agreement, int(index)))
-        return max(found, key=lambda registration: registration.fit + registration.agreement)
+        index = int(likeness.argmax())
+        pose, fit, agreement = polish(
+            motions, self.templates[index].painted, view.painted, lambda m: self._agreements(m, view, similar)
+        )
+        return Registration(pose, fit, agreement, index)
 
     def residuals(self, views: Sequence[View], points: FloatArray) -> FloatArray:
         """Distance ``(I, N)`` in metres from where ``points (N, 3)`` of the first view should be to what is there."""
@@ -171,17 +168,15 @@ class MovingObject:
         column[view.cells] = np.arange(len(view.cells))
         padded = np.pad(np.concatenate(similar), ((0, 0), (0, 1)))  # far from all foreground nothing agrees
         points = np.concatenate([template.points for template in self.templates])
-        starts = np.cumsum([0, *(len(template.points) for template in self.templates[:-1])])
         sizes = np.array([len(template.points) for template in self.templates])
-        result = np.zeros(len(motions))
-        for index, motion in enumerate(motions):
-            pixels = project(
-                transform_points(motion, points), view.observation.intrinsics, view.observation.camera_pose
-            )
-            cells, shares = view.descriptors.around(pixels)
-            value = (np.take_along_axis(padded, column[cells], axis=1) * shares).sum(axis=1)
-            result[index] = np.sort(np.add.reduceat(value, starts) / sizes)[-BEST_VIEWS:].mean()
-        return result
+        starts = np.cumsum([0, *sizes[:-1]])
+        moved = points @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
+        pixels = project(moved.reshape(-1, 3), view.observation.intrinsics, view.observation.camera_pose)
+        cells, shares = view.descriptors.around(pixels)
+        rows = np.tile(np.arange(len(points)), len(motions))[:, None]
+        values = (padded[rows, column[cells]] * shares).sum(axis=1).reshape(len(motions), -1)
+        means = np.add.reduceat(values, starts, axis=1) / sizes
+        return np.sort(means, axis=1)[:, -BEST_VIEWS:].mean(axis=1)
 
 
 def moving_objects(views: Sequence[View], min_points: int, seed: int) -> list[MovingObject]:

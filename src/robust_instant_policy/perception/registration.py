@@ -14,22 +14,23 @@ import numpy as np
 from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.perception.descriptors import Float32Array
 
-TURN_BINS = 36
+TURN_BINS = 24
 SHIFT_BIN_M = 0.015
 PEAKS = 4
 MATCHES_PER_POINT = 3
+MAX_VOTERS = 400  # the most similar matches; the others say nothing new
 VOTE_SHARPNESS = 4  # power of the similarity with which a match votes
 COLOUR_SCALE_M = 0.06  # metres that count as much as the difference between black and white in one channel
 COLOUR_CAP_M = 0.010  # and no difference counts more: objects of one kind come in many colours
 NEAR_M = 0.010  # residual at which a point counts about a third
 OWN_M = 0.04  # image points further from the object are not its own
 VARIANT_TURNS = np.deg2rad([0.0, -25.0, 25.0])
-SYMMETRY_TURNS = np.deg2rad([-20.0, -15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0])
+SYMMETRY_TURNS = np.deg2rad([-20.0, -15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0])  # the middle one is none
 SYMMETRY_LOSS = 0.04  # of the fit; an object that loses less by these turns looks the same from all sides
 OPINION_SCALE = 0.01  # of the agreement; how much a worse turn counts
 COARSE_POINTS = 60
 FINALISTS = 3
-COARSE_REACH_M = (0.06, 0.05, 0.04, 0.03, 0.025, 0.02, 0.02, 0.02)
+COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)
 PATCH_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
 FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
 
@@ -45,13 +46,20 @@ def upright_motions(source: FloatArray, target: FloatArray, weights: FloatArray)
     """Motions ``(..., 4, 4)`` that turn about the vertical only and carry ``source (..., N, 3)`` onto
     ``target (..., N, 3)`` with the least squared error under ``weights (..., N)``.
     """
-    share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
-    source_mean = (share * source).sum(axis=-2)
-    target_mean = (share * target).sum(axis=-2)
-    a = (source - source_mean[..., None, :])[..., :2]
-    b = (target - target_mean[..., None, :])[..., :2]
-    cross = (share[..., 0] * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])).sum(axis=-1)
-    rotation = turns_about_vertical(np.arctan2(cross, (share * a * b).sum(axis=(-2, -1))))
+    share = weights / weights.sum(axis=-1, keepdims=True)
+    source_mean = (share[..., None, :] @ source)[..., 0, :]
+    target_mean = (share[..., None, :] @ target)[..., 0, :]
+    a = source[..., :2] - source_mean[..., None, :2]
+    b = target[..., :2] - target_mean[..., None, :2]
+    return _motions(np.swapaxes(a * share[..., None], -1, -2) @ b, source_mean, target_mean)
+
+
+def _motions(products: FloatArray, source_mean: FloatArray, target_mean: FloatArray) -> FloatArray:
+    """The upright motions that fit best, from the weighted sums ``(..., 2, 2)`` of the products of the points'
+    horizontal coordinates about their means ``(..., 3)``.
+    """
+    sine = products[..., 0, 1] - products[..., 1, 0]
+    rotation = turns_about_vertical(np.arctan2(sine, products[..., 0, 0] + products[..., 1, 1]))
     motion = np.zeros((*rotation.shape[:-2], 4, 4))
     motion[..., :3, :3] = rotation
     motion[..., :3, 3] = target_mean - (rotation @ source_mean[..., None])[..., 0]
@@ -66,9 +74,13 @@ def proposals(source: FloatArray, target: FloatArray, similarities: FloatArray) 
     """
     count = min(MATCHES_PER_POINT, len(target))
     best = np.argpartition(-similarities, count - 1, axis=1)[:, :count]
-    p = np.repeat(source, count, axis=0)
-    q = target[best.reshape(-1)]
-    weight = np.maximum(np.take_along_axis(similarities, best, axis=1).reshape(-1), 0) ** VOTE_SHARPNESS
+    # Turned about the object's middle, a shift is where the object goes, and few bins hold them all.
+    middle = source.mean(axis=0)
+    likeness = np.take_along_axis(similarities, best, axis=1).reshape(-1)
+    voters = np.argsort(-likeness, kind="stable")[:MAX_VOTERS]
+    p = (source - middle)[voters // count]
+    q = target[best.reshape(-1)[voters]]
+    weight = np.maximum(likeness[voters], 0).astype(np.float64) ** VOTE_SHARPNESS
     turns = np.arange(TURN_BINS) * 2 * np.pi / TURN_BINS
     cos, sin = np.cos(turns)[:, None], np.sin(turns)[:, None]
     shift = np.stack([q[:, 0] - (cos * p[:, 0] - sin * p[:, 1]), q[:, 1] - (sin * p[:, 0] + cos * p[:, 1])], axis=-1)
@@ -87,7 +99,7 @@ def proposals(source: FloatArray, target: FloatArray, similarities: FloatArray) 
         agree = np.zeros(len(p))
         for near in (turn - 1, turn, turn + 1):
             agree += (np.abs(bins[near % TURN_BINS] - (x, y)) <= 1).all(axis=1)
-        motions.append(upright_motions(p, q, weight * (agree > 0)))
+        motions.append(upright_motions(p + middle, q, weight * (agree > 0)))
         votes[np.arange(turn - 3, turn + 4) % TURN_BINS, max(0, x - 3) : x + 4, max(0, y - 3) : y + 4] = 0
     return np.array(motions)
 
@@ -111,7 +123,8 @@ def polish(
     best = int((fits + agreements).argmax())
     motion = finalists[best]
     near = turned(motion, middle, SYMMETRY_TURNS)
-    if closest_points(near, source, target, ())[1].min() > fits[best] - SYMMETRY_LOSS:
+    turned_fits = closest_points(near, *coarse, ())[1]
+    if turned_fits.min() > turned_fits[len(near) // 2] - SYMMETRY_LOSS:
         # Points alone cannot tell how a disc is turned; the descriptors' opinion is averaged.
         opinion = agreement(near)
         share = np.exp((opinion - opinion.max()) / OPINION_SCALE)
@@ -135,29 +148,38 @@ def closest_points(
     Both directions, because an object slid along itself covers its old place well: only the points left bare tell.
     """
     count, size = len(motions), len(source)
-    paint = ((source[:, None, 3:] - target[:, 3:]) ** 2).sum(axis=2).clip(max=COLOUR_CAP_M**2)
-    fixed = paint + (target[:, :3] ** 2).sum(axis=1)
+    places, goals = np.ascontiguousarray(source[:, :3]), np.ascontiguousarray(target[:, :3])
+    fixed = _paint(source, target) + (goals**2).sum(axis=1)
+    towards = np.ascontiguousarray(-2 * goals.T)
+    costs = np.empty((count, size, len(target)), dtype=np.float32)  # one for all rounds: making it anew is slow
     fits = np.zeros(count)
     for reach in (*reaches, 0.0):
-        moved = source[:, :3] @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
-        moved = moved.astype(np.float32)
-        products = (moved.reshape(-1, 3) @ (-2 * target[:, :3].T)).reshape(count, size, len(target))
-        costs = products + fixed + (moved**2).sum(axis=2)[..., None]
+        moved = (places @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]).astype(np.float32)
+        np.matmul(moved, towards, out=costs)
+        costs += fixed
+        costs += np.einsum("cnx,cnx->cn", moved, moved)[..., None]
         forth, back = costs.argmin(axis=2), costs.argmin(axis=1)
         forth_cost = np.take_along_axis(costs, forth[..., None], axis=2)[..., 0]
         back_cost = np.take_along_axis(costs, back[:, None], axis=1)[:, 0]
         own = back_cost < OWN_M**2  # the rest of the image belongs to something else
         if reach:
             weights = np.concatenate([np.exp(-forth_cost / reach**2), own * np.exp(-back_cost / reach**2)], axis=1)
-            source_points = np.concatenate([np.broadcast_to(source[:, :3], (count, size, 3)), source[back, :3]], axis=1)
-            target_points = np.concatenate(
-                [target[forth, :3], np.broadcast_to(target[:, :3], (count, len(target), 3))], axis=1
-            )
-            motions = upright_motions(source_points, target_points, weights + 1e-9)
+            source_points = np.concatenate([np.broadcast_to(places, (count, size, 3)), places[back]], axis=1)
+            target_points = np.concatenate([goals[forth], np.broadcast_to(goals, (count, len(goals), 3))], axis=1)
+            motions = upright_motions(source_points, target_points, weights + np.float32(1e-9))
         else:
             explained = (own * np.exp(-back_cost / NEAR_M**2)).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
             fits = np.sqrt(np.exp(-forth_cost / NEAR_M**2).mean(axis=1) * explained)
     return motions, fits
+
+
+def _paint(source: Float32Array, target: Float32Array) -> Float32Array:
+    """How much the colours of ``source (N, 6)`` and ``target (M, 6)`` differ: ``(N, M)`` square metres, capped."""
+    a, b = source[:, 3:], target[:, 3:]
+    squares = a @ (-2 * b.T)
+    squares += (b**2).sum(axis=1)
+    squares += (a**2).sum(axis=1)[:, None]
+    return np.minimum(squares, np.float32(COLOUR_CAP_M**2), out=squares)
 
 
 def painted(points: FloatArray, colours: Float32Array) -> Float32Array:
@@ -172,11 +194,13 @@ def local_shift(pose: FloatArray, patch: Float32Array, target: Float32Array) -> 
     edges, handles and tips of an object of another size are followed.
     """
     moved = transform_points(pose, patch[:, :3].astype(np.float64))
-    paint = ((patch[:, None, 3:] - target[:, 3:]) ** 2).sum(axis=2).clip(max=COLOUR_CAP_M**2)
+    goals = target[:, :3].astype(np.float64)
+    fixed = _paint(patch, target) + (goals**2).sum(axis=1)
     shift = np.zeros(3)
     for reach in PATCH_REACH_M:
-        costs = (((moved + shift)[:, None] - target[:, :3]) ** 2).sum(axis=2) + paint
+        there = moved + shift
+        costs = fixed - 2 * there @ goals.T + (there**2).sum(axis=1)[:, None]
         nearest = costs.argmin(axis=1)
         weights = np.exp(-costs[np.arange(len(moved)), nearest] / reach**2) + 1e-9
-        shift = shift + weights @ (target[nearest, :3] - moved - shift) / weights.sum()
+        shift = shift + weights @ (goals[nearest] - there) / weights.sum()
     return shift
