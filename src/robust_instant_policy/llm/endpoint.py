@@ -19,15 +19,7 @@ from openai.types.chat import ChatCompletion
 
 from robust_instant_policy.errors import ModelError
 from robust_instant_policy.llm.dialect import ServerFacts
-from robust_instant_policy.llm.model import (
-    DEADLINE_S,
-    Accept,
-    OnAnswer,
-    OnProgress,
-    Tally,
-    context_error,
-    estimate_tokens,
-)
+from robust_instant_policy.llm.model import NOBODY, Listener, Sampling, Tally, context_error, estimate_tokens
 from robust_instant_policy.query import Answer, Query
 
 KEY_VARIABLE = "OPENAI_API_KEY"
@@ -74,22 +66,12 @@ class Endpoint:
         return _run(self._counted(text))
 
     def sample(
-        self,
-        queries: Sequence[Query],
-        n: int,
-        *,
-        temperature: float,
-        seed: int = 0,
-        first_index: int = 0,
-        deadline_s: float = DEADLINE_S,
-        accept: Accept | None = None,
-        on_progress: OnProgress | None = None,
-        on_answer: OnAnswer | None = None,
+        self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY
     ) -> list[list[Answer]]:
         """See `LanguageModel.sample`."""
-        tally = Tally(len(queries), n, first_index, accept, on_progress, on_answer)
-        if queries and n > 0:
-            _run(_Plan(self, queries, tally, temperature, seed, deadline_s).carry_out())
+        tally = Tally(len(queries), sampling, listener)
+        if queries and sampling.n > 0:
+            _run(_Plan(self, queries, tally, sampling).carry_out())
         return tally.answers()
 
     def close(self) -> None:
@@ -240,18 +222,9 @@ class Endpoint:
 class _Plan:
     """All answers of one call of `Endpoint.sample`, under one deadline."""
 
-    def __init__(
-        self,
-        endpoint: Endpoint,
-        queries: Sequence[Query],
-        tally: Tally,
-        temperature: float,
-        seed: int,
-        deadline_s: float,
-    ):
-        self._endpoint, self._queries, self._tally = endpoint, queries, tally
-        self._temperature, self._seed, self._deadline_s = temperature, seed, deadline_s
-        self._deadline = time.monotonic() + deadline_s
+    def __init__(self, endpoint: Endpoint, queries: Sequence[Query], tally: Tally, sampling: Sampling):
+        self._endpoint, self._queries, self._tally, self._sampling = endpoint, queries, tally, sampling
+        self._deadline = time.monotonic() + sampling.deadline_s
         self._room = asyncio.Semaphore(MAX_CONCURRENT)
         self._unreachable = 0
         self._last_failure = "nothing came back"
@@ -259,7 +232,7 @@ class _Plan:
     async def carry_out(self) -> None:
         failure: ModelError | None = None
         try:
-            async with asyncio.timeout(self._deadline_s), self._endpoint.client() as client:
+            async with asyncio.timeout(self._sampling.deadline_s), self._endpoint.client() as client:
                 await self._refuse_long(client)
                 try:
                     async with asyncio.TaskGroup() as group:
@@ -273,7 +246,7 @@ class _Plan:
             raise failure from None
         if self._tally.is_empty:
             raise ModelError(
-                f"{self._endpoint.name} at {self._endpoint.url} gave no answer within {self._deadline_s:g} s: "
+                f"{self._endpoint.name} at {self._endpoint.url} gave no answer within {self._sampling.deadline_s:g} s: "
                 f"{self._last_failure}"
             )
 
@@ -308,8 +281,8 @@ class _Plan:
                         client,
                         self._queries[index],
                         len(samples),
-                        self._temperature,
-                        _seed(self._seed, samples[0], self._tally.attempt(index, samples[0])),
+                        self._sampling.temperature,
+                        _seed(self._sampling.seed, samples[0], self._tally.attempt(index, samples[0])),
                         max(PATIENCE * (self._deadline - time.monotonic()), 0.1),
                     )
                 self._unreachable = 0

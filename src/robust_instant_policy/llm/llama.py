@@ -22,14 +22,7 @@ from typing import Any
 
 from robust_instant_policy.errors import MissingExtraError, ModelError
 from robust_instant_policy.llm.gguf import read_header
-from robust_instant_policy.llm.model import (
-    DEADLINE_S,
-    Accept,
-    OnAnswer,
-    OnProgress,
-    Tally,
-    context_error,
-)
+from robust_instant_policy.llm.model import NOBODY, Listener, Sampling, Tally, context_error
 from robust_instant_policy.query import Answer, Query
 
 SHORT_TOKENS = 1024  # prompts up to this long, with their answers, are run many at once
@@ -99,22 +92,12 @@ class LlamaModel:
             return len(json.load(response)["tokens"])
 
     def sample(
-        self,
-        queries: Sequence[Query],
-        n: int,
-        *,
-        temperature: float,
-        seed: int = 0,
-        first_index: int = 0,
-        deadline_s: float = DEADLINE_S,
-        accept: Accept | None = None,
-        on_progress: OnProgress | None = None,
-        on_answer: OnAnswer | None = None,
+        self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY
     ) -> list[list[Answer]]:
         """See `LanguageModel.sample`."""
-        deadline = _Deadline(time.monotonic() + deadline_s)
-        tally = Tally(len(queries), n, first_index, accept, on_progress, on_answer)
-        if not queries or n < 1:
+        deadline = _Deadline(time.monotonic() + sampling.deadline_s)
+        tally = Tally(len(queries), sampling, listener)
+        if not queries or sampling.n < 1:
             return tally.answers()
         with self._lock:  # one plan at a time: two would only slow each other down
             layout = self._layout_for(queries)
@@ -122,16 +105,16 @@ class LlamaModel:
                 self._start(layout)
             if layout.is_long:
                 for index, query in enumerate(queries):
-                    self._ask_together(index, query, tally, temperature, seed, deadline)
+                    self._ask_together(index, query, tally, sampling, deadline)
             else:
-                self._ask_apart(queries, tally, temperature, seed, deadline)
+                self._ask_apart(queries, tally, sampling, deadline)
         return tally.answers()
 
     def close(self) -> None:
         self._servers, self._slots, self._layout = [], [], None
 
     def _ask_apart(
-        self, queries: Sequence[Query], tally: Tally, temperature: float, seed: int, deadline: _Deadline
+        self, queries: Sequence[Query], tally: Tally, sampling: Sampling, deadline: _Deadline
     ) -> None:
         self._assign(queries)
 
@@ -139,7 +122,7 @@ class LlamaModel:
             for index in slot.queue:
                 query = queries[index]
                 while (missing := tally.missing(index)) and not deadline.has_passed:
-                    request = _request(query, temperature, _seed(seed, missing[0], tally.attempt(index, missing[0])))
+                    request = _request(query, sampling, missing[0], tally.attempt(index, missing[0]))
                     request["id_slot"] = slot.number
                     slot.text = query.text
                     for answer in _complete(slot.server, request, 1, deadline):
@@ -184,11 +167,11 @@ class LlamaModel:
                 ).queue.append(index)
 
     def _ask_together(
-        self, index: int, query: Query, tally: Tally, temperature: float, seed: int, deadline: _Deadline
+        self, index: int, query: Query, tally: Tally, sampling: Sampling, deadline: _Deadline
     ) -> None:
         while (missing := tally.missing(index)) and not deadline.has_passed:
             together = missing[:LONG_SLOTS]
-            request = _request(query, temperature, _seed(seed, together[0], tally.attempt(index, together[0])))
+            request = _request(query, sampling, together[0], tally.attempt(index, together[0]))
             request["n"] = len(together)
             answers = _complete(self._servers[0], request, len(together), deadline)
             for sample, answer in zip(together, answers, strict=False):
@@ -245,12 +228,12 @@ class LlamaModel:
         return params
 
 
-def _request(query: Query, temperature: float, seed: int) -> dict[str, Any]:
+def _request(query: Query, sampling: Sampling, sample: int, attempt: int) -> dict[str, Any]:
     request: dict[str, Any] = {
         "prompt": query.text,
         "max_tokens": query.max_tokens,
-        "temperature": temperature,
-        "seed": seed,
+        "temperature": sampling.temperature,
+        "seed": _seed(sampling.seed, sample, attempt),
         "cache_prompt": True,
         "stream": True,
         "return_progress": True,  # so that the deadline is looked at while a long prompt is read, too

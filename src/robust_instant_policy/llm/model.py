@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from robust_instant_policy.errors import ModelError
@@ -16,6 +17,34 @@ MAX_ROUNDS = 8  # times an answer that does not parse is asked for again before 
 Accept = Callable[[int, str], bool]  # query index, text
 OnProgress = Callable[[int, int], None]  # accepted answers, wanted answers
 OnAnswer = Callable[[int, int, int, Answer, bool], None]  # query index, sample index, attempt, answer, accepted
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How answers are drawn: ``n`` of them to each query, numbered from ``first_index``, so that more can be had later,
+    within ``deadline_s`` seconds of wall time for all together."""
+
+    n: int
+    temperature: float
+    seed: int = 0
+    first_index: int = 0
+    deadline_s: float = DEADLINE_S
+
+    @property
+    def indices(self) -> range:
+        return range(self.first_index, self.first_index + self.n)
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Who hears of answers as they come. Answers that ``accept`` refuses are asked for again."""
+
+    accept: Accept | None = None
+    on_progress: OnProgress | None = None
+    on_answer: OnAnswer | None = None
+
+
+NOBODY = Listener()
 
 
 class LanguageModel(Protocol):
@@ -37,25 +66,13 @@ class LanguageModel(Protocol):
     def count_tokens(self, text: str) -> int: ...
 
     def sample(
-        self,
-        queries: Sequence[Query],
-        n: int,
-        *,
-        temperature: float,
-        seed: int = 0,
-        first_index: int = 0,
-        deadline_s: float = DEADLINE_S,
-        accept: Accept | None = None,
-        on_progress: OnProgress | None = None,
-        on_answer: OnAnswer | None = None,
+        self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY
     ) -> list[list[Answer]]:
-        """For each query up to ``n`` independent answers, in the order of their sample index.
+        """For each query up to ``sampling.n`` independent answers, in the order of their sample index.
 
-        Samples are numbered ``first_index … first_index + n - 1``, so that more can be had later. Answers that
-        ``accept`` refuses are asked for again until ``deadline_s`` seconds have passed (or `MAX_ROUNDS` times);
-        what has arrived by then is returned, so lists may be short or empty. ``on_answer`` sees every answer,
-        accepted or not. Raises `ModelError` when the model cannot be reached or used at all, and, before anything
-        is sent, when a prompt does not fit into its context.
+        Refused answers are asked for again until the deadline has passed (or `MAX_ROUNDS` times); what has arrived
+        by then is returned, so lists may be short or empty. Raises `ModelError` when the model cannot be reached or
+        used at all, and, before anything is sent, when a prompt does not fit into its context.
         """
         ...
 
@@ -65,20 +82,12 @@ class LanguageModel(Protocol):
 class Tally:
     """Which samples of which query are still missing. Safe to use from several threads."""
 
-    def __init__(
-        self,
-        num_queries: int,
-        n: int,
-        first_index: int = 0,
-        accept: Accept | None = None,
-        on_progress: OnProgress | None = None,
-        on_answer: OnAnswer | None = None,
-    ):
-        self._missing = [list(range(first_index, first_index + n)) for _ in range(num_queries)]
+    def __init__(self, num_queries: int, sampling: Sampling, listener: Listener = NOBODY):
+        self._missing = [list(sampling.indices) for _ in range(num_queries)]
         self._attempts: list[dict[int, int]] = [{} for _ in range(num_queries)]
         self._accepted: list[dict[int, Answer]] = [{} for _ in range(num_queries)]
-        self._total = num_queries * n
-        self._accept, self._on_progress, self._on_answer = accept, on_progress, on_answer
+        self._total = num_queries * sampling.n
+        self._listener = listener
         self._lock = threading.Lock()
 
     def missing(self, query_index: int) -> list[int]:
@@ -93,7 +102,8 @@ class Tally:
             return self._attempts[query_index].get(index, 0)
 
     def add(self, query_index: int, index: int, answer: Answer) -> None:
-        accepted = self._accept is None or self._accept(query_index, answer.text)
+        hear = self._listener
+        accepted = hear.accept is None or hear.accept(query_index, answer.text)
         with self._lock:
             if index not in self._missing[query_index]:
                 return
@@ -102,10 +112,10 @@ class Tally:
             if accepted:
                 self._missing[query_index].remove(index)
                 self._accepted[query_index][index] = answer
-            if self._on_answer is not None:
-                self._on_answer(query_index, index, attempt, answer, accepted)
-            if accepted and self._on_progress is not None:
-                self._on_progress(sum(map(len, self._accepted)), self._total)
+            if hear.on_answer is not None:
+                hear.on_answer(query_index, index, attempt, answer, accepted)
+            if accepted and hear.on_progress is not None:
+                hear.on_progress(sum(map(len, self._accepted)), self._total)
 
     @property
     def is_empty(self) -> bool:

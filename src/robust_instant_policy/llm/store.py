@@ -13,14 +13,7 @@ from pathlib import Path
 from typing import IO
 
 from robust_instant_policy.errors import ModelError, UsageError
-from robust_instant_policy.llm.model import (
-    DEADLINE_S,
-    Accept,
-    LanguageModel,
-    OnAnswer,
-    OnProgress,
-    estimate_tokens,
-)
+from robust_instant_policy.llm.model import NOBODY, Accept, LanguageModel, Listener, Sampling, estimate_tokens
 from robust_instant_policy.query import Answer, Query
 
 BUSY_TIMEOUT_S = 60.0  # how long a write waits for another process
@@ -36,6 +29,9 @@ CREATE TABLE IF NOT EXISTS answers (
   text TEXT, prompt_tokens INTEGER NOT NULL DEFAULT 0, cached_tokens INTEGER NOT NULL DEFAULT 0,
   completion_tokens INTEGER NOT NULL DEFAULT 0, seconds REAL NOT NULL DEFAULT 0,
   PRIMARY KEY (model, query, settings, sample, attempt)
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS failures (
+  model TEXT NOT NULL, request TEXT NOT NULL, message TEXT NOT NULL, PRIMARY KEY (model, request)
 ) WITHOUT ROWID;
 """
 # A row without text says that the sample was asked for and no (acceptable) answer came in time.
@@ -143,6 +139,19 @@ class SampleStore:
         )
         return [None if row[0] is None else replace(Answer(*row), replayed=True) for row in rows]
 
+    def write_failure(self, model: str, queries: Sequence[Query], sampling: Sampling, message: str) -> None:
+        """Keep the words with which a model failed; a replay fails with the same."""
+        row = (model, _request_digest(queries, sampling), message)
+        with self._lock:
+            self._db.execute("INSERT OR REPLACE INTO failures VALUES (?, ?, ?)", row)
+
+    def read_failure(self, model: str, queries: Sequence[Query], sampling: Sampling) -> str | None:
+        """How the model failed the last time these queries were asked together, if it did."""
+        rows = self._select(
+            "SELECT message FROM failures WHERE model = ? AND request = ?", (model, _request_digest(queries, sampling))
+        )
+        return rows[0][0] if rows else None
+
     def _select(self, sql: str, values: Sequence[object] = ()) -> list[tuple]:
         with self._lock:
             return self._db.execute(sql, values).fetchall()
@@ -167,47 +176,36 @@ class RecordedModel:
         return self._model.count_tokens(text)
 
     def sample(
-        self,
-        queries: Sequence[Query],
-        n: int,
-        *,
-        temperature: float,
-        seed: int = 0,
-        first_index: int = 0,
-        deadline_s: float = DEADLINE_S,
-        accept: Accept | None = None,
-        on_progress: OnProgress | None = None,
-        on_answer: OnAnswer | None = None,
+        self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY
     ) -> list[list[Answer]]:
         """See `LanguageModel.sample`; asks the model only for queries of which a sample is missing."""
-        settings = _settings(temperature, seed)
-        found, unasked = _look_up(self._store, self.name, queries, n, settings, first_index, accept, on_answer)
+        found, unasked = _look_up(self._store, self.name, queries, sampling, listener)
         if not unasked:
             return found
         asked = [queries[index] for index in unasked]
+        accept, settings = listener.accept, _settings(sampling)
 
         def keep(position: int, sample: int, attempt: int, answer: Answer, accepted: bool) -> None:
             self._store.write(self.name, asked[position], settings, sample, attempt, answer)
-            if on_answer is not None:
-                on_answer(unasked[position], sample, attempt, answer, accepted)
+            if listener.on_answer is not None:
+                listener.on_answer(unasked[position], sample, attempt, answer, accepted)
 
-        fresh = self._model.sample(
-            asked,
-            n,
-            temperature=temperature,
-            seed=seed,
-            first_index=first_index,
-            deadline_s=deadline_s,
-            accept=None if accept is None else lambda position, text: accept(unasked[position], text),
-            on_progress=on_progress,
-            on_answer=keep,
+        to_model = Listener(
+            None if accept is None else lambda position, text: accept(unasked[position], text),
+            listener.on_progress,
+            keep,
         )
+        try:
+            fresh = self._model.sample(asked, sampling, to_model)
+        except ModelError as error:
+            self._store.write_failure(self.name, queries, sampling, str(error))
+            raise
         for position, answers in enumerate(fresh):
-            if len(answers) < n:
-                for sample in range(first_index, first_index + n):
+            if len(answers) < sampling.n:
+                for sample in sampling.indices:
                     self._store.write(self.name, asked[position], settings, sample, _NOTHING_CAME, None)
         # What the store holds now, not what came: a sample that was there already stays what it was.
-        kept, _ = _look_up(self._store, self.name, queries, n, settings, first_index, accept, None)
+        kept, _ = _look_up(self._store, self.name, queries, sampling, Listener(accept))
         for index in unasked:
             found[index] = [replace(answer, replayed=False) for answer in kept[index]]
         return found
@@ -232,28 +230,20 @@ class ReplayedModel:
         return estimate_tokens(text)
 
     def sample(
-        self,
-        queries: Sequence[Query],
-        n: int,
-        *,
-        temperature: float,
-        seed: int = 0,
-        first_index: int = 0,
-        deadline_s: float = DEADLINE_S,
-        accept: Accept | None = None,
-        on_progress: OnProgress | None = None,
-        on_answer: OnAnswer | None = None,
+        self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY
     ) -> list[list[Answer]]:
-        """See `LanguageModel.sample`; raises `ModelError` for a sample that was never recorded."""
-        settings = _settings(temperature, seed)
-        found, unasked = _look_up(self._store, self.name, queries, n, settings, first_index, accept, on_answer)
+        """See `LanguageModel.sample`; raises what the model raised then, and `ModelError` for a sample that was never
+        recorded."""
+        found, unasked = _look_up(self._store, self.name, queries, sampling, listener)
         if unasked:
+            failure = self._store.read_failure(self.name, queries, sampling)
             raise ModelError(
-                f"{self._store.path} lacks the answers to {len(unasked)} of {len(queries)} prompts of this plan; "
+                failure
+                or f"{self._store.path} lacks the answers to {len(unasked)} of {len(queries)} prompts of this plan; "
                 "run once without --replay to record them"
             )
-        if on_progress is not None:
-            on_progress(sum(map(len, found)), len(queries) * n)
+        if listener.on_progress is not None:
+            listener.on_progress(sum(map(len, found)), len(queries) * sampling.n)
         return found
 
     def close(self) -> None:
@@ -261,30 +251,24 @@ class ReplayedModel:
 
 
 def _look_up(
-    store: SampleStore,
-    model: str,
-    queries: Sequence[Query],
-    n: int,
-    settings: str,
-    first_index: int,
-    accept: Accept | None,
-    on_answer: OnAnswer | None,
+    store: SampleStore, model: str, queries: Sequence[Query], sampling: Sampling, listener: Listener
 ) -> tuple[list[list[Answer]], list[int]]:
     """Stored answers to each query, and the indices of queries of which a sample has to be asked for."""
     found: list[list[Answer]] = [[] for _ in queries]
     unasked = []
+    settings = _settings(sampling)
     for index, query in enumerate(queries):
-        attempts = [store.read(model, query, settings, sample) for sample in range(first_index, first_index + n)]
-        chosen = [next(_accepted(index, tries, accept), None) for tries in attempts]
+        attempts = [store.read(model, query, settings, sample) for sample in sampling.indices]
+        chosen = [next(_accepted(index, tries, listener.accept), None) for tries in attempts]
         if any(answer is None and None not in tries for answer, tries in zip(chosen, attempts, strict=True)):
             unasked.append(index)
             continue
         found[index] = [answer for answer in chosen if answer is not None]
-        if on_answer is not None:
-            for sample, tries in enumerate(attempts, first_index):
+        if listener.on_answer is not None:
+            for sample, own, tries in zip(sampling.indices, chosen, attempts, strict=True):
                 for attempt, answer in enumerate(tries):
                     if answer is not None:
-                        on_answer(index, sample, attempt, answer, answer is chosen[sample - first_index])
+                        listener.on_answer(index, sample, attempt, answer, answer is own)
     return found, unasked
 
 
@@ -294,8 +278,14 @@ def _accepted(index: int, tries: list[Answer | None], accept: Accept | None) -> 
             yield answer
 
 
-def _settings(temperature: float, seed: int) -> str:
-    return json.dumps({"seed": seed, "temperature": temperature}, sort_keys=True)
+def _settings(sampling: Sampling) -> str:
+    """What decides an answer besides its query and number; a deadline does not."""
+    return json.dumps({"seed": sampling.seed, "temperature": sampling.temperature}, sort_keys=True)
+
+
+def _request_digest(queries: Sequence[Query], sampling: Sampling) -> str:
+    fields = [*map(_digest, queries), _settings(sampling), str(sampling.first_index), str(sampling.n)]
+    return hashlib.sha256(json.dumps(fields).encode()).hexdigest()
 
 
 def _digest(query: Query) -> str:
