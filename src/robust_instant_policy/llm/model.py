@@ -65,9 +65,7 @@ class LanguageModel(Protocol):
 
     def count_tokens(self, text: str) -> int: ...
 
-    def sample(
-        self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY
-    ) -> list[list[Answer]]:
+    def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """For each query up to ``sampling.n`` independent answers, in the order of their sample index.
 
         Refused answers are asked for again until the deadline has passed (or `MAX_ROUNDS` times); what has arrived

@@ -79,6 +79,10 @@ class SampleStore:
         )
         return [StoredCount(*row) for row in rows]
 
+    def names(self) -> list[str]:
+        """The models that were asked, whether they answered or not."""
+        return [name for (name,) in self._select("SELECT model FROM answers UNION SELECT model FROM failures")]
+
     def export(self, file: IO[str], form: str = "jsonl") -> int:
         """Write all answers with their prompts as JSON lines or CSV; returns how many."""
         names = (
@@ -175,9 +179,7 @@ class RecordedModel:
     def count_tokens(self, text: str) -> int:
         return self._model.count_tokens(text)
 
-    def sample(
-        self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY
-    ) -> list[list[Answer]]:
+    def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """See `LanguageModel.sample`; asks the model only for queries of which a sample is missing."""
         found, unasked = _look_up(self._store, self.name, queries, sampling, listener)
         if not unasked:
@@ -215,12 +217,18 @@ class RecordedModel:
 
 
 class ReplayedModel:
-    """The answers that a store holds of the model ``name``, without the model."""
+    """The answers that a store holds of the model ``name``, without the model.
+
+    Of a model file the name without its fingerprint will do, where only one of that name was asked.
+    """
 
     counts_exactly = False
 
     def __init__(self, store: SampleStore, name: str):
-        known = [count.model for count in store.models()]
+        known = store.names()
+        files = [model for model in known if model.startswith(f"{name}@")]
+        if name not in known and len(files) == 1:
+            name = files[0]
         if name not in known:
             raise ModelError(f"{store.path} holds no answers of {name!r}; it has: {', '.join(known) or 'nothing'}")
         self._store, self.name = store, name
@@ -229,9 +237,7 @@ class ReplayedModel:
     def count_tokens(self, text: str) -> int:
         return estimate_tokens(text)
 
-    def sample(
-        self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY
-    ) -> list[list[Answer]]:
+    def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """See `LanguageModel.sample`; raises what the model raised then, and `ModelError` for a sample that was never
         recorded."""
         found, unasked = _look_up(self._store, self.name, queries, sampling, listener)

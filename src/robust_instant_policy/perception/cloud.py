@@ -99,4 +99,4 @@ def foreground(
 
 def _colours(rgb: NDArray[np.uint8], pixels: IntArray) -> Float32Array:
     """Colours ``(N, 3)`` in [0, 1] at ``pixels (N, 2)``."""
-    return rgb[pixels[:, 1], pixels[:, 0]] / np.float32(255)
+    return np.divide(rgb[pixels[:, 1], pixels[:, 0]], 255, dtype=np.float32)

@@ -53,17 +53,17 @@ def surface_depth(depth: NDArray[np.float32], pixels: ArrayLike, radius: int = 2
     windows = windows.reshape(len(centre), -1)
     middle = windows[:, windows.shape[1] // 2]
     readings = np.sort(windows, axis=1)  # missing ones last
+    rows, last = np.arange(len(readings)), windows.shape[1] - 1
     jump = np.diff(readings, axis=1) > SURFACE_TOLERANCE * readings[:, :-1]
-    surface = np.zeros(readings.shape, dtype=np.intp)  # number of the surface that a reading belongs to
+    surface = np.zeros(windows.shape, dtype=np.intp)  # number of the surface that a reading belongs to
     surface[:, 1:] = jump.cumsum(axis=1)
-    numbers = surface + np.arange(len(readings))[:, None] * readings.shape[1]
-    size = np.bincount(numbers[np.isfinite(readings)], minlength=readings.size).reshape(readings.shape)
+    numbers = surface + rows[:, None] * windows.shape[1]
+    size = np.bincount(numbers[np.isfinite(readings)], minlength=readings.size).reshape(windows.shape)
     # A missing centre is compared false throughout, so it belongs to no surface.
-    own = np.take_along_axis(surface, (readings < middle[:, None]).sum(axis=1).clip(max=size.shape[1] - 1)[:, None], 1)
-    own_counts = np.isfinite(middle)[:, None] & (np.take_along_axis(size, own, axis=1) >= MIN_SUPPORT)
-    chosen = np.where(own_counts, own, size.argmax(axis=1)[:, None])
-    count = np.take_along_axis(size, chosen, axis=1)
-    first = (surface < chosen).sum(axis=1)[:, None]
-    lower = np.take_along_axis(readings, first + (count - 1).clip(0) // 2, axis=1)
-    upper = np.take_along_axis(readings, (first + count // 2).clip(max=size.shape[1] - 1), axis=1)
-    return np.where(count >= MIN_SUPPORT, (lower.astype(np.float64) + upper) / 2, np.nan)[:, 0]
+    own = surface[rows, np.minimum((readings < middle[:, None]).sum(axis=1), last)]
+    chosen = np.where(np.isfinite(middle) & (size[rows, own] >= MIN_SUPPORT), own, size.argmax(axis=1))
+    count = size[rows, chosen]
+    first = (surface < chosen[:, None]).sum(axis=1)
+    lower = readings[rows, first + np.maximum(count - 1, 0) // 2].astype(np.float64)
+    upper = readings[rows, np.minimum(first + count // 2, last)]
+    return np.where(count >= MIN_SUPPORT, (lower + upper) / 2, np.nan)

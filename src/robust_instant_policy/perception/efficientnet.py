@@ -53,7 +53,7 @@ class EfficientNetDescriptors:
             Image.Resampling.LANCZOS,
         )
         enlarged = np.asarray(loaded.resize((cols, rows), Image.Resampling.BICUBIC), dtype=np.float32) / 255
-        features = self._features((enlarged - MEAN) / DEVIATION)
+        features = self._features(((enlarged - MEAN) / DEVIATION).astype(np.float32, copy=False))
         step = np.array([width / cols, height / rows]) * FINEST_STRIDE
         # "Same" padding of this network puts the extra pixel on the right, so cell i looks at input pixel 4i + 3.
         origin = (np.array([width / cols, height / rows]) * (FINEST_STRIDE - 0.5)) - 0.5

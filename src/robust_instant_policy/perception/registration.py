@@ -67,7 +67,7 @@ def _motions(products: FloatArray, source_mean: FloatArray, target_mean: FloatAr
     return motion
 
 
-def proposals(source: FloatArray, target: FloatArray, similarities: FloatArray) -> FloatArray:
+def proposals(source: FloatArray, target: FloatArray, similarities: Float32Array) -> FloatArray:
     """At most `PEAKS` motions ``(P, 4, 4)`` on which most matches agree, from ``similarities (N, M)``.
 
     Each of ``source (N, 3)`` is matched with the `MATCHES_PER_POINT` most similar of ``target (M, 3)``.

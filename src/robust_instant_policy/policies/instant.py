@@ -14,7 +14,7 @@ from robust_instant_policy.context.prompt import Frames, InContextPrompt, Layout
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import PlanningError, UsageError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.llm import LanguageModel
+from robust_instant_policy.llm import LanguageModel, Listener, Sampling
 from robust_instant_policy.perception import Located
 from robust_instant_policy.policies.keypoint_context import KeypointContext
 from robust_instant_policy.policies.policy import Progress, Stage, Usage, no_progress
@@ -107,7 +107,7 @@ class InstantPolicy:
         # Where the demonstrations agree on every number there is nothing to ask, and every candidate is the same.
         count = min((len(of_query) for of_query in answers), default=num_queries)
         if count < min(MIN_VALID_ANSWERS, num_queries):
-            raise PlanningError(_too_few(count, num_queries, answers, heard.seconds))
+            raise PlanningError(_too_few(count, num_queries, answers, self.deadline_s))
         candidates = tuple(
             self.prompt.trajectory([of_query[index].text for of_query in answers], heard.located.keypoints)
             for index in range(count)
@@ -124,13 +124,8 @@ class InstantPolicy:
         start = time.perf_counter()
         more = self.llm.sample(
             heard.queries,
-            num_queries - heard.num_asked,
-            temperature=self.temperature,
-            seed=self.seed,
-            first_index=heard.num_asked,
-            deadline_s=self.deadline_s,
-            accept=self.prompt.accepts,
-            on_progress=lambda done, total: self.progress("language model", done, total),
+            Sampling(num_queries - heard.num_asked, self.temperature, self.seed, heard.num_asked, self.deadline_s),
+            Listener(self.prompt.accepts, lambda done, total: self.progress("language model", done, total)),
         )
         heard.seconds += time.perf_counter() - start
         heard.num_asked = num_queries
@@ -162,12 +157,12 @@ def _sampling(heard: _Heard, answers: Sequence[Sequence[Answer]]) -> Stage:
     )
 
 
-def _too_few(count: int, wanted: int, answers: Sequence[Sequence[Answer]], seconds: float) -> str:
+def _too_few(count: int, wanted: int, answers: Sequence[Sequence[Answer]], deadline_s: float) -> str:
     said = next((answer.text for of_query in answers for answer in of_query), None)
     heard = f"it said, for one, {said[:QUOTED_ANSWER_CHARS]!r}" if said else "it said nothing usable"
     answered = sum(len(of_query) == wanted for of_query in answers)
     return (
-        f"after {seconds:.0f} s there are {count} usable trajectories of {wanted}, {min(MIN_VALID_ANSWERS, wanted)} "
+        f"within {deadline_s:g} s came {count} usable trajectories of {wanted}, {min(MIN_VALID_ANSWERS, wanted)} "
         f"are needed ({answered} of {len(answers)} prompts answered in full; {heard}); "
         "give it more time (--deadline) or another model (--llm)"
     )
