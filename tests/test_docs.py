@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 TARGETS = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-OTHER_PROGRAMS = {"git", "cd", "pip", "export", "vllm", "ollama", "llama-server", "docker", "sglang", "lms"}
+OTHER_PROGRAMS = {"git", "cd", "pip", "export", "vllm", "ollama", "llama-server", "docker", "sglang", "lms", "ray"}
 
 
 def blocks(page: Path, *languages: str) -> list[str]:

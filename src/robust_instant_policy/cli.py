@@ -121,7 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--out", type=Path, required=True, metavar="DIR")
     _method_options(evaluate)
 
-    report = command("report", _report, "write the report of a run folder again")
+    report = command("report", _report, "write the report of a run, or of an evaluation, again")
     report.add_argument("folder", type=Path, metavar="DIR")
 
     view = command("view", _view, "a page that shows every demonstration of a folder")
@@ -277,6 +277,12 @@ def _eval(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
+    if (options.folder / "episodes.parquet").exists():
+        from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
+
+        publish(options.folder)
+        print(options.folder / PAGE_FILE)
+        return 0
     from robust_instant_policy.report import write_report
 
     print(write_report(options.folder))

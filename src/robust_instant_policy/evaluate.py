@@ -10,7 +10,7 @@ from robust_instant_policy.evaluation import Analysis, Episode, Progress, Setup,
 from robust_instant_policy.evaluation.episodes import EPISODES_FILE
 from robust_instant_policy.evaluation.manifest import session
 from robust_instant_policy.evaluation.processes import Processes
-from robust_instant_policy.evaluation.publication import publish
+from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
 from robust_instant_policy.evaluation.work import Hands, Outcome
 from robust_instant_policy.llm import model_name
 
@@ -42,7 +42,7 @@ def evaluate(
         run_suites(suites, setup, out, _hands(workers, ray), Progress(recording, outcome))
     screen.say("")
     screen.say(publish(out))
-    screen.say(f"rows: {out / EPISODES_FILE}")
+    screen.say(f"rows: {out / EPISODES_FILE}; all of it: {out / PAGE_FILE}")
 
 
 def _hands(workers: int, ray: str | None) -> Hands:

@@ -1,23 +1,76 @@
-"""A run's folder turned into what people look at: tables now, whenever rows came."""
+"""A run's folder turned into what people look at: tables, figures and one page, whenever its rows came."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
 from robust_instant_policy.datasets.files import write_whole
+from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.episodes import open_episodes
+from robust_instant_policy.evaluation.experiment import plan_file, wanted_plans
+from robust_instant_policy.evaluation.failures import open_failures
+from robust_instant_policy.evaluation.figures import draw, encode
 from robust_instant_policy.evaluation.manifest import Manifest
+from robust_instant_policy.evaluation.page import Section, write_page
+from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.summary import Summary
-from robust_instant_policy.evaluation.tables import tables
+from robust_instant_policy.evaluation.tables import Table, failure_table, tables
+from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.policies import Plan
 
 TABLE_FILE = "table.md"
+FAILURE_TABLE_FILE = "failures.md"
+PAGE_FILE = "index.html"
 
 
 def publish(out: Path) -> str:
-    """Write ``out/table.md`` with the tables of all suites in ``out`` and return its text."""
-    with closing(open_episodes(out)) as episodes:
-        summaries = [Summary(suite, episodes.rows) for suite in Manifest.read(out).suites]
-    text = "\n".join(table.markdown() for summary in summaries if summary.rows for table in tables(summary))
+    """Write, for each suite in ``out``, ``SUITE.md``, ``SUITE.svg`` and ``SUITE.png``; then ``failures.md``,
+    ``table.md`` with all tables, and ``index.html``. Returns the text of ``table.md``.
+
+    Raises `DatasetError` where nothing has been executed yet.
+    """
+    with closing(open_episodes(out)) as table:
+        episodes = table.rows
+    with closing(open_failures(out)) as table_of_failures:
+        failures = table_of_failures.rows
+    if not episodes:
+        raise DatasetError(f"{out} holds no executions yet; run rip eval --out {out} first")
+    manifest = Manifest.read(out)
+    sections, shown = [], []
+    for suite in manifest.suites:
+        summary = Summary(suite, episodes)
+        if summary.rows:
+            sections.append(_publish_suite(out, suite, summary))
+            shown += summary.rows
+    rows = list({row.key: row for row in shown}.values())
+    lost = failure_table(rows, failures)
+    text = _text([table for section in sections for table in section.tables])
+    write_whole(out / FAILURE_TABLE_FILE, lost.markdown().encode())
     write_whole(out / TABLE_FILE, text.encode())
+    page = write_page(out, manifest, sections, rows, failures, lost)
+    write_whole(out / PAGE_FILE, page.encode())
     return text
+
+
+def _publish_suite(out: Path, suite: Suite, summary: Summary) -> Section:
+    stem = suite.name if suite.objects == "seen" else f"{suite.name}-{suite.objects}"
+    figure = draw(summary, _kept_plans(out, suite))
+    drawing = encode(figure, "svg")
+    section = Section(suite.name, suite.objects, drawing, tables(summary))
+    write_whole(out / f"{stem}.svg", drawing)
+    write_whole(out / f"{stem}.png", encode(figure, "png"))
+    write_whole(out / f"{stem}.md", _text(section.tables).encode())
+    return section
+
+
+def _text(shown: Sequence[Table]) -> str:
+    return "\n".join(table.markdown() for table in shown)
+
+
+def _kept_plans(out: Path, suite: Suite) -> dict[tuple[Scene, Variant], Plan]:
+    if not suite.keeps_plans:
+        return {}
+    files = {plan: out / plan_file(*plan) for plan in wanted_plans([suite])}
+    return {plan: Plan.load(path) for plan, path in files.items() if path.exists()}

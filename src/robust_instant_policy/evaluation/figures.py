@@ -1,0 +1,259 @@
+"""The paper's figures, drawn from rows: readable in grey, every axis with its unit."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from robust_instant_policy.evaluation import paper
+from robust_instant_policy.evaluation.summary import Summary
+from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.policies import Plan
+from robust_instant_policy.trajectory import Trajectory
+
+WIDTH_IN, HEIGHT_IN = 7.0, 2.8  # of a figure over both columns of a paper
+PNG_DPI = 200
+MM = 1000.0
+PARAMETERS = {
+    "font.size": 8,
+    "font.family": "DejaVu Sans",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "hatch.linewidth": 0.5,
+    "legend.frameon": False,
+    "svg.hashsalt": "rip",  # the same rows give the same file
+    "svg.fonttype": "none",
+}
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a method looks: by brightness, hatch, marker and line, so that colour is not needed to tell it."""
+
+    colour: str
+    hatch: str
+    marker: str
+    line: str
+
+
+STYLES = {
+    "rip": Style("#4a78ad", "", "o", "-"),
+    "rip-gauss": Style("#a9c8e8", "//", "s", "--"),
+    "rip-adaptive": Style("#3f9188", "xx", "D", (0, (5, 1))),  # type: ignore[arg-type]
+    "kat": Style("#d98032", "..", "^", "-."),
+    "kat-dp": Style("#f0c58f", "\\\\", "v", ":"),
+    "dp": Style("#c9c9c9", "--", "P", (0, (1, 1))),  # type: ignore[arg-type]
+    "neighbours": Style("#e8e0d0", "oo", "X", (0, (3, 1, 1, 1))),  # type: ignore[arg-type]
+}
+PLAIN = Style("#808080", "++", "*", (0, (1, 2)))  # type: ignore[arg-type]
+
+
+def draw(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan]) -> Figure:
+    """The figure of a suite; ``plans`` are those it kept."""
+    with matplotlib.rc_context(PARAMETERS):
+        if summary.suite.name == "trajectories":
+            return _trajectories(summary, plans)
+        return _FIGURES[summary.suite.name](summary)
+
+
+def encode(figure: Figure, form: str) -> bytes:
+    """The figure as ``"svg"`` or ``"png"``; the same figure gives the same bytes."""
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(PARAMETERS):
+        figure.savefig(buffer, format=form, dpi=PNG_DPI, metadata={"Date": None} if form == "svg" else None)
+    return buffer.getvalue()
+
+
+def _success_bars(summary: Summary) -> Figure:
+    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
+    axes = figure.add_subplot()
+    _bars(axes, summary, [_style(variant) for variant in summary.variants], _names(summary.variants))
+    told = any(variant.method in paper.TABLE1 for variant in summary.variants)
+    _legend_above(axes, "paper, with GPT-4o" if told else "", 4)
+    return figure
+
+
+def _bars(axes: Axes, summary: Summary, styles: Sequence[Style], labels: Sequence[str]) -> None:
+    """One group of bars a task and one for their average; whiskers are Wilson's 95% interval, over tasks ± 1 sd."""
+    groups = [*summary.tasks, "average"]
+    width = 0.84 / len(summary.variants)
+    for index, (variant, style) in enumerate(zip(summary.variants, styles, strict=True)):
+        offset = (index - (len(summary.variants) - 1) / 2) * width
+        for group, task in enumerate(groups):
+            if task == "average":
+                mean, deviation = summary.over_tasks(variant)
+                low, high = max(0.0, mean - deviation), min(1.0, mean + deviation)
+            else:
+                rate = summary.rate(variant, task)
+                if rate is None:
+                    continue
+                mean, (low, high) = rate.value, rate.interval
+            axes.bar(
+                group + offset,
+                100 * mean,
+                width,
+                color=style.colour,
+                edgecolor="black",
+                linewidth=0.5,
+                hatch=style.hatch,
+                label=labels[index] if task == "average" else None,
+            )
+            whisker = 100 * np.array([[max(0.0, mean - low)], [max(0.0, high - mean)]])
+            axes.errorbar(group + offset, 100 * mean, whisker, color="black", linewidth=0.7, capsize=1.5)
+            told = paper.table1(variant.method, task)
+            if told is not None and summary.suite.name != "downsampling":
+                _told(axes, group + offset, width, told)
+    axes.set_xticks(range(len(groups)), groups)
+    _success_axis(axes)
+
+
+def _told(axes: Axes, centre: float, width: float, percent: float) -> None:
+    """The paper's number: a line across the bar, edged in white so that it shows on dark ones."""
+    ends = [centre - width / 2, centre + width / 2]
+    axes.plot(ends, [percent, percent], color="white", linewidth=3.2, solid_capstyle="butt", zorder=4)
+    axes.plot(ends, [percent, percent], color="black", linewidth=1.6, solid_capstyle="butt", zorder=5)
+
+
+def _legend_above(axes: Axes, told: str, columns: int) -> None:
+    handles, _ = axes.get_legend_handles_labels()
+    if told:
+        handles.append(Line2D([], [], color="black", linewidth=1.6, label=told))
+    axes.legend(handles=handles, ncols=columns, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+
+
+def _demos(summary: Summary) -> Figure:
+    figure = Figure(figsize=(WIDTH_IN / 1.6, HEIGHT_IN), layout="constrained")
+    axes = figure.add_subplot()
+    counts = sorted({variant.demos for variant in summary.variants})
+    methods = list(dict.fromkeys(variant.method for variant in summary.variants))
+    for number, method in enumerate(methods):
+        shown = sorted((one for one in summary.variants if one.method == method), key=lambda one: one.demos)
+        # a little apart, so that methods that do equally well can be told
+        places = [counts.index(one.demos) + 0.06 * (number - (len(methods) - 1) / 2) for one in shown]
+        _curve(axes, summary, shown, places, _style(shown[0]), method)
+    axes.set_xticks(range(len(counts)), [str(count) for count in counts])
+    axes.set_xlabel("demonstrations shown")
+    _success_axis(axes)
+    axes.legend(loc="lower right")
+    return figure
+
+
+def _sweep(summary: Summary, label: str, value: Callable[[Variant], str]) -> Figure:
+    figure = Figure(figsize=(WIDTH_IN / 2, HEIGHT_IN), layout="constrained")
+    axes = figure.add_subplot()
+    places = list(range(len(summary.variants)))
+    _curve(axes, summary, summary.variants, places, STYLES["rip"], "mean ± sd over tasks")
+    markers = "svD^P*X"
+    for marker, task in zip(markers * len(summary.tasks), summary.tasks, strict=False):
+        rates = [summary.rate(variant, task) for variant in summary.variants]
+        known = [(place, 100 * rate.value) for place, rate in zip(places, rates, strict=True) if rate is not None]
+        axes.plot(*zip(*known, strict=True), marker, color="#777777", fillstyle="none", markersize=4, label=task)
+    axes.set_xticks(places, [value(variant) for variant in summary.variants])
+    axes.set_xlabel(label)
+    _success_axis(axes)
+    axes.legend(loc="lower right", fontsize=6.5)
+    return figure
+
+
+def _curve(
+    axes: Axes, summary: Summary, variants: Sequence[Variant], places: Sequence[float], style: Style, label: str
+) -> None:
+    spread = np.array([summary.over_tasks(variant) for variant in variants])
+    mean, deviation = 100 * spread.T
+    axes.fill_between(places, mean - deviation, np.minimum(mean + deviation, 100), color=style.colour, alpha=0.15, lw=0)
+    axes.plot(
+        places, mean, style.marker, linestyle=style.line, color="black", markerfacecolor=style.colour,
+        markeredgecolor="black", markeredgewidth=0.5, markersize=5, linewidth=0.9, label=label,
+    )  # fmt: skip
+
+
+def _downsampling(summary: Summary) -> Figure:
+    figure = Figure(figsize=(WIDTH_IN / 2 + 0.5 * len(summary.tasks), HEIGHT_IN), layout="constrained")
+    axes = figure.add_subplot()
+    ways = [variant.downsampling for variant in summary.variants]
+    looks = {"uniform": STYLES["dp"], "masked": STYLES["rip"]}
+    names = {"uniform": "normal (uniform)", "masked": "gripper-based (masked)"}
+    _bars(axes, summary, [looks[way] for way in ways], [names[way] for way in ways])
+    width = 0.84 / len(ways)
+    for index, way in enumerate(ways):
+        centre = len(summary.tasks) + (index - (len(ways) - 1) / 2) * width
+        _told(axes, centre, width, paper.DOWNSAMPLING[way])
+    _legend_above(axes, "paper, average of 5 tasks", 2)
+    return figure
+
+
+def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan]) -> Figure:
+    """Palm position over time in the scene in which RIP and the Gaussian part the most (Oh et al. 2025, Fig. 4a)."""
+    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
+    panels = figure.subplots(1, 3, sharex=True)
+    by_scene: dict[Scene, dict[str, Plan]] = {}
+    for (scene, variant), plan in plans.items():
+        by_scene.setdefault(scene, {})[variant.method] = plan
+    whole = {scene: of for scene, of in by_scene.items() if {"rip", "rip-gauss"} <= of.keys()}
+    if not whole:
+        return figure
+    scene = max(whole, key=lambda one: _apart(whole[one]["rip"].trajectory, whole[one]["rip-gauss"].trajectory))
+    robust, gauss = whole[scene]["rip"], whole[scene]["rip-gauss"]
+    for axis, panel in enumerate(panels):
+        for candidate, hallucinated in zip(robust.candidates, robust.hallucinated, strict=True):
+            label = "KAT, hallucinated" if hallucinated else "KAT"
+            style = {"linestyle": ":", "linewidth": 1.6} if hallucinated else {"linestyle": "-", "linewidth": 0.8}
+            panel.plot(candidate.times, MM * candidate.actions[:, axis], color="#9a9a9a", label=label, **style)
+        for plan, method, label in ((gauss, "rip-gauss", "RIP Gaussian"), (robust, "rip", "RIP")):
+            look = STYLES[method]
+            panel.plot(
+                plan.trajectory.times, MM * plan.trajectory.actions[:, axis], linestyle=look.line, color=look.colour,
+                marker=look.marker, markersize=3, markevery=4, linewidth=1.4, label=label,
+            )  # fmt: skip
+        panel.set_xlabel("time, share of the episode")
+        panel.set_ylabel(f"palm {'xyz'[axis]} [mm]")
+    handles, labels = panels[0].get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=len(unique))
+    figure.suptitle(f"{scene.task}, scene {scene.seed}", fontsize=8, y=1.12)
+    return figure
+
+
+def _apart(one: Trajectory, other: Trajectory) -> float:
+    times = np.linspace(0.0, 1.0, 50)
+    points = [trajectory.resampled(times).actions[:, :3] for trajectory in (one, other)]
+    return float(np.linalg.norm(points[0] - points[1], axis=1).max())
+
+
+def _success_axis(axes: Axes) -> None:
+    axes.set_ylim(0, 104)
+    axes.set_ylabel("success [%]")
+    axes.grid(axis="y", linewidth=0.3, color="#bbbbbb")
+    axes.set_axisbelow(True)
+
+
+def _style(variant: Variant) -> Style:
+    return STYLES.get(variant.method, PLAIN)
+
+
+def _names(variants: Sequence[Variant]) -> list[str]:
+    methods = [variant.method for variant in variants]
+    return [one.method if methods.count(one.method) == 1 else str(one) for one in variants]
+
+
+def _dof_label(variant: Variant) -> str:
+    return "∞" if variant.dof is None or math.isinf(variant.dof) else f"{variant.dof:g}"
+
+
+_FIGURES: dict[str, Callable[[Summary], Figure]] = {
+    "chosen": _success_bars,
+    "table1": _success_bars,
+    "demos": _demos,
+    "queries": lambda summary: _sweep(summary, "queries Q", lambda variant: str(variant.queries)),
+    "dof": lambda summary: _sweep(summary, "degrees of freedom ν", _dof_label),
+    "downsampling": _downsampling,
+}
