@@ -1,6 +1,6 @@
 """An evaluation on a local Ray cluster of two nodes, one of which is killed half-way: the run ends complete.
 
-python benchmarks/cluster.py --data data --out runs/cluster [--samples runs/simulation/samples.sqlite] [--table FILE]
+python benchmarks/cluster.py --data data --out runs/cluster [--samples runs/paper/samples.sqlite] [--table FILE]
 
 Each node is a raylet of its own with one core, as on another machine. The same scenes are done once more by two
 processes on this machine, and the rows are compared: they must be equal up to order and times. Without --samples only

@@ -18,7 +18,6 @@ from robust_instant_policy.evaluation.processes import ONE_THREAD
 from robust_instant_policy.evaluation.work import Agenda, Outcome, SceneWork, Setup
 from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.llm import SampleStore
-from robust_instant_policy.query import Answer, Query
 
 CORES_A_WORKER = 1
 LOOK_SECONDS = 2.0  # between two looks at whether a worker can be had by now
@@ -160,24 +159,15 @@ class _Keeper:
 
 
 class _DistantStore:
-    """A `SampleStore` on another machine, as far as a model needs it."""
+    """A `SampleStore` on another machine: whatever is asked of it is asked there."""
 
     def __init__(self, keeper: Any, path: Path):
         self._keeper, self.path = keeper, path
 
-    def models(self) -> Any:
-        return self._call("models")
-
-    def read(self, model: str, query: Query, settings: str, sample: int) -> list[Answer | None]:
-        return self._call("read", model, query, settings, sample)
-
-    def write(self, model: str, query: Query, settings: str, sample: int, attempt: int, answer: Answer | None) -> None:
-        self._call("write", model, query, settings, sample, attempt, answer)
-
-    def _call(self, name: str, *arguments: Any) -> Any:
+    def __getattr__(self, name: str) -> Any:
         import ray
 
-        return ray.get(self._keeper.call.remote(name, arguments))
+        return lambda *arguments: ray.get(self._keeper.call.remote(name, arguments))
 
 
 def _most_demonstrations(setup: Setup, works: list[SceneWork]) -> dict[str, list[Demonstration]]:

@@ -152,11 +152,13 @@ def _sessions(sessions: Sequence[Session], episodes: Sequence[Episode]) -> str:
         for one in sessions
     )
     models = sorted({row.variant.model for row in episodes if row.variant.model})
-    planning, physics = sum(row.seconds for row in episodes), sum(row.physics_seconds for row in episodes)
+    planning = sum(row.seconds for row in episodes if row.candidate == 0)
+    physics = sum(row.physics_seconds for row in episodes)
     return (
         f"<p>Language model: {html.escape(', '.join(models) or 'none was asked')}. "
-        f"{sum(one.hours for one in sessions):.1f} hours in all; of the executions kept here, planning took "
-        f"{planning / 3600:.1f} h (counted once an execution), physics {physics / 3600:.1f} h.</p>"
+        f"{sum(one.hours for one in sessions):.1f} hours in all, in the sessions below; planning took "
+        f"{planning / 3600:.1f} hours of it (samples that were stored already cost next to nothing) and physics "
+        f"{physics / 3600:.1f}.</p>"
         "<table class=words><tr><th>command</th><th>began (UTC)</th><th>hours</th><th>machine</th><th>code</th></tr>"
         f"{rows}</table>"
     )

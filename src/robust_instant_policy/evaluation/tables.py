@@ -145,15 +145,16 @@ def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> T
     keys = {row.key for row in episodes}
     known = [failure for failure in failures if failure.key in keys]
     methods = list(dict.fromkeys(row.variant.method for row in episodes))
+    stages_met = [stage for stage in STAGES if any(failure.stage == stage for failure in known)]
     rows = []
     for method in methods:
         executions = [row for row in episodes if row.variant.method == method]
         lost = sum(not row.success for row in executions)
         stages = [failure.stage for failure in known if failure.variant.method == method]
-        cells = [f"{stages.count(stage)} ({stages.count(stage) / lost:.0%})" if lost else NONE for stage in STAGES]
+        cells = [f"{stages.count(stage)} ({stages.count(stage) / lost:.0%})" if lost else NONE for stage in stages_met]
         rows.append((method, str(len(executions)), str(lost), *cells, str(lost - len(stages))))
     return Table(
-        ("method", "executions", "failed", *(f"{stage} off" for stage in STAGES), "not examined"),
+        ("method", "executions", "failed", *(f"{stage} off" for stage in stages_met), "not examined"),
         tuple(rows),
         "Each failed episode is laid at the first stage that is to blame when parts are replaced by the truth, one by "
         "one: execution (the demonstrator's own trajectory, played back, fails), keypoints (with the true ones it "

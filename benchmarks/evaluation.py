@@ -1,0 +1,131 @@
+"""How fast an evaluation runs when its samples are replayed, where the time goes, and what a second worker brings.
+
+python benchmarks/evaluation.py --samples runs/paper/samples.sqlite --out docs/tables/evaluation_speed.md
+
+The samples must hold the scenes of `rip eval --suite table1` for the tasks and methods measured here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from robust_instant_policy.evaluation.processes import ONE_THREAD
+
+os.environ.update(ONE_THREAD)  # as the workers have it; before anything computes
+
+from robust_instant_policy.evaluation import Choice, Progress, Setup, Suite, Variant, make_suites, run_suites
+from robust_instant_policy.evaluation.episodes import Episode
+from robust_instant_policy.evaluation.processes import Processes
+from robust_instant_policy.evaluation.work import SceneWork
+from robust_instant_policy.evaluation.workbench import Workbench
+from robust_instant_policy.llm import model_name
+
+METHODS = ("rip", "rip-gauss", "kat")
+PARTS = ("planning", "building scenes", "rendering", "physics")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("data"))
+    parser.add_argument("--samples", type=Path, required=True)
+    parser.add_argument("--tasks", nargs="+", default=["push-cube", "turn-faucet", "close-cabinet", "open-drawer"])
+    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    base = Variant("rip", model=model_name("embedded"))
+    (suite,) = make_suites(["table1"], Choice(base, options.tasks, METHODS, options.episodes))
+    with tempfile.TemporaryDirectory() as folder:
+        store = Path(folder) / "samples.sqlite"
+        shutil.copy(options.samples, store)
+        setup = Setup("embedded", True, store, options.data, 300.0, films=False)
+        lines = _shares(suite, setup)
+        lines += ["", *_scaling(suite, setup, Path(folder))]
+    lines += ["", f"{os.cpu_count()} cores; load of the machine while measuring {os.getloadavg()[1]:.1f}."]
+    text = "\n".join(lines) + "\n"
+    print(text)
+    if options.out:
+        options.out.write_text(text)
+
+
+def _shares(suite: Suite, setup: Setup) -> list[str]:
+    """One worker, its parts timed; the time before the first scene of a task (simulator, fitting) is left out."""
+    lines = [
+        f"| task | executions | a minute and core | {' | '.join(PARTS)} | rest |",
+        f"| --- | --- | --- | {' | '.join('---' for _ in PARTS)} | --- |",
+    ]
+    bench = Workbench(setup)
+    for task in suite.tasks:
+        first, *others = [scene for scene in suite.scenes if scene.task == task]
+        list(bench.run(SceneWork(first, suite.variants)))
+        spent: dict[str, float] = defaultdict(float)
+        undo = _time_parts(bench, spent)
+        start = time.perf_counter()
+        rows = [row for scene in others for row in bench.run(SceneWork(scene, suite.variants)) if _is_episode(row)]
+        seconds = time.perf_counter() - start
+        undo()
+        shares = [spent[part] / seconds for part in PARTS]
+        cells = " | ".join(f"{share:.0%}" for share in (*shares, 1 - sum(shares)))
+        lines.append(f"| {task} | {len(rows)} | {60 * len(rows) / seconds:.0f} | {cells} |")
+    bench.close()
+    return lines
+
+
+def _is_episode(outcome: object) -> bool:
+    return isinstance(outcome, Episode)
+
+
+def _time_parts(bench: Workbench, spent: dict[str, float]) -> Callable[[], None]:
+    """Have the parts of `bench` add what they take to ``spent``; returns what undoes it."""
+    task: Any = bench._task
+    cell = next(value for value in vars(task).values() if hasattr(value, "photograph"))
+    undo = []
+
+    def timed(owner: Any, name: str, part: str, without: str | None = None) -> None:
+        original = getattr(owner, name)
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            start, before = time.perf_counter(), spent[without] if without else 0.0
+            result = original(*arguments, **named)
+            inner = spent[without] - before if without else 0.0
+            spent[part] += time.perf_counter() - start - inner
+            return result
+
+        setattr(owner, name, call)
+        undo.append((owner, name))
+
+    timed(cell, "photograph", "rendering")
+    timed(task, "reset", "building scenes", without="rendering")
+    timed(task, "execute", "physics")
+    for policy in bench._policies.values():
+        timed(policy, "plan", "planning")
+    return lambda: [delattr(owner, name) for owner, name in undo] and None
+
+
+def _scaling(suite: Suite, setup: Setup, folder: Path) -> list[str]:
+    """The whole suite by one worker and by two, from the command to the last row and from the first row on."""
+    lines = ["| workers | executions | seconds | a minute, from the first row on |", "| --- | --- | --- | --- |"]
+    for workers in (1, 2):
+        arrivals: list[float] = []
+
+        def outcome(done: int, total: int, what: object, arrivals: list[float] = arrivals) -> None:
+            if _is_episode(what):
+                arrivals.append(time.perf_counter())
+
+        start = time.perf_counter()
+        progress = Progress(lambda *_: None, outcome)
+        run_suites([suite], setup, folder / f"workers-{workers}", Processes(workers), progress)
+        rate = 60 * (len(arrivals) - 1) / (arrivals[-1] - arrivals[0])
+        lines.append(f"| {workers} | {len(arrivals)} | {arrivals[-1] - start:.0f} | {rate:.0f} |")
+    return lines
+
+
+if __name__ == "__main__":
+    main()
