@@ -17,7 +17,6 @@ from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.summary import Summary
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.policies import Plan
-from robust_instant_policy.trajectory import Trajectory
 
 WIDTH_IN, HEIGHT_IN = 7.0, 2.8  # of a figure over both columns of a paper
 PNG_DPI = 200
@@ -42,19 +41,20 @@ class Style:
     colour: str
     hatch: str
     marker: str
-    line: str
+    line: str | tuple[float, tuple[float, ...]]
 
 
 STYLES = {
     "rip": Style("#4a78ad", "", "o", "-"),
     "rip-gauss": Style("#a9c8e8", "//", "s", "--"),
-    "rip-adaptive": Style("#3f9188", "xx", "D", (0, (5, 1))),  # type: ignore[arg-type]
-    "kat": Style("#d98032", "..", "^", "-."),
-    "kat-dp": Style("#f0c58f", "\\\\", "v", ":"),
-    "dp": Style("#c9c9c9", "--", "P", (0, (1, 1))),  # type: ignore[arg-type]
-    "neighbours": Style("#e8e0d0", "oo", "X", (0, (3, 1, 1, 1))),  # type: ignore[arg-type]
+    "rip-adaptive": Style("#3f9188", "xx", "D", (0, (5, 1))),
+    "kat": Style("#d98032", "\\\\", "^", "-."),
+    "kat-dp": Style("#f0c58f", "||", "v", ":"),
+    "dp": Style("#c9c9c9", "--", "P", (0, (1, 1))),
+    "neighbours": Style("#e8e0d0", "++", "X", (0, (3, 1, 1, 1))),
+    "gp": Style("#b9a3c9", "|//", "p", (0, (6, 2))),
 }
-PLAIN = Style("#808080", "++", "*", (0, (1, 2)))  # type: ignore[arg-type]
+PLAIN = Style("#808080", "-/", "*", (0, (1, 2)))
 
 
 def draw(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan]) -> Figure:
@@ -201,32 +201,36 @@ def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan])
     whole = {scene: of for scene, of in by_scene.items() if {"rip", "rip-gauss"} <= of.keys()}
     if not whole:
         return figure
-    scene = max(whole, key=lambda one: _apart(whole[one]["rip"].trajectory, whole[one]["rip-gauss"].trajectory))
+    scene = max(whole, key=lambda one: _worth_showing(whole[one]["rip"], whole[one]["rip-gauss"]))
     robust, gauss = whole[scene]["rip"], whole[scene]["rip-gauss"]
     for axis, panel in enumerate(panels):
         for candidate, hallucinated in zip(robust.candidates, robust.hallucinated, strict=True):
             label = "KAT, hallucinated" if hallucinated else "KAT"
             style = {"linestyle": ":", "linewidth": 1.6} if hallucinated else {"linestyle": "-", "linewidth": 0.8}
             panel.plot(candidate.times, MM * candidate.actions[:, axis], color="#9a9a9a", label=label, **style)
-        for plan, method, label in ((gauss, "rip-gauss", "RIP Gaussian"), (robust, "rip", "RIP")):
+        for plan, method, colour, label in (
+            (gauss, "rip-gauss", "black", "RIP Gaussian"),
+            (robust, "rip", None, "RIP"),
+        ):
             look = STYLES[method]
             panel.plot(
-                plan.trajectory.times, MM * plan.trajectory.actions[:, axis], linestyle=look.line, color=look.colour,
-                marker=look.marker, markersize=3, markevery=4, linewidth=1.4, label=label,
+                plan.trajectory.times, MM * plan.trajectory.actions[:, axis], linestyle=look.line, linewidth=1.2,
+                color=colour or look.colour, marker=look.marker, markersize=3, markevery=4, label=label,
             )  # fmt: skip
         panel.set_xlabel("time, share of the episode")
         panel.set_ylabel(f"palm {'xyz'[axis]} [mm]")
     handles, labels = panels[0].get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=len(unique))
-    figure.suptitle(f"{scene.task}, scene {scene.seed}", fontsize=8, y=1.12)
+    panels[1].set_title(f"{scene.task}, scene {scene.seed}", fontsize=8)
     return figure
 
 
-def _apart(one: Trajectory, other: Trajectory) -> float:
+def _worth_showing(robust: Plan, gauss: Plan) -> tuple[bool, float]:
+    """Whether a candidate is hallucinated, and how far it pulls the Gaussian away, in metres."""
     times = np.linspace(0.0, 1.0, 50)
-    points = [trajectory.resampled(times).actions[:, :3] for trajectory in (one, other)]
-    return float(np.linalg.norm(points[0] - points[1], axis=1).max())
+    points = [plan.trajectory.resampled(times).actions[:, :3] for plan in (robust, gauss)]
+    return bool(robust.hallucinated.any()), float(np.linalg.norm(points[0] - points[1], axis=1).max())
 
 
 def _success_axis(axes: Axes) -> None:
