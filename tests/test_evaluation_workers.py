@@ -13,6 +13,7 @@ import pytest
 
 from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.datasets.files import lock_folder
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation import (
     Choice,
@@ -29,6 +30,7 @@ from robust_instant_policy.evaluation import (
     run_suites,
     scene_seed,
 )
+from robust_instant_policy.evaluation.cluster import Cluster
 from robust_instant_policy.evaluation.failures import Inquest, film, true_keypoints, video_file
 from robust_instant_policy.evaluation.manifest import session
 from robust_instant_policy.evaluation.processes import Processes
@@ -87,6 +89,26 @@ def test_two_workers_of_which_one_is_killed_write_the_rows_that_one_writes(inter
     assert killed
     assert timeless(open_episodes(tmp_path).rows) == timeless(rows)
     assert not multiprocessing.active_children()
+
+
+def test_a_ray_cluster_writes_the_rows_that_a_process_writes(interrupted, workbench, tmp_path):
+    pytest.importorskip("ray")
+    rows, _, _ = interrupted
+    suites = make_suites(["chosen"], Choice(NEIGHBOURS, ["push-cube"], ["neighbours"], 2))
+    setup = Setup("embedded", False, tmp_path / "samples.sqlite", workbench / "data", 60.0, films=False)
+    run_suites(suites, setup, tmp_path, Cluster("local", 1), Progress(lambda *_: None, lambda *_: None))
+    assert timeless(open_episodes(tmp_path).rows) == timeless(rows[:2])
+
+
+def test_two_evaluations_do_not_write_into_one_folder(tmp_path):
+    suites = make_suites(["chosen"], Choice(NEIGHBOURS, ["push-cube"], ["neighbours"], 1))
+    setup = Setup("embedded", False, tmp_path / "samples.sqlite", tmp_path, 60.0, films=False)
+    lock = lock_folder(tmp_path)
+    try:
+        with pytest.raises(DatasetError, match="another process"):
+            run_suites(suites, setup, tmp_path, Processes(1), Progress(lambda *_: None, lambda *_: None))
+    finally:
+        os.close(lock)
 
 
 def test_an_error_in_a_worker_is_told_in_one_line(workbench, tmp_path, monkeypatch, capsys):

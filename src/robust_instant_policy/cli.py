@@ -115,7 +115,7 @@ def _parser() -> argparse.ArgumentParser:
         "--objects", choices=("seen", "unseen"), default="seen", help="test with objects like those shown, or others"
     )
     evaluate.add_argument("--replay", action="store_true", help="answer from the stored samples only, without a model")
-    evaluate.add_argument("--workers", type=_positive, default=1, metavar="N", help="processes (default: %(default)s)")
+    evaluate.add_argument("--workers", type=_positive, metavar="N", help="default: 1, or a Ray cluster's cores")
     evaluate.add_argument("--ray", metavar="ADDRESS", help="work on the Ray cluster at this address ('auto': this one)")
     evaluate.add_argument("--no-videos", action="store_true", help="do not film failed episodes once more")
     evaluate.add_argument("--out", type=Path, required=True, metavar="DIR")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from robust_instant_policy.console import StageConsole
 from robust_instant_policy.evaluation import Analysis, Episode, Progress, Setup, Suite, run_suites
+from robust_instant_policy.evaluation.cluster import Cluster
 from robust_instant_policy.evaluation.episodes import EPISODES_FILE
 from robust_instant_policy.evaluation.manifest import session
 from robust_instant_policy.evaluation.processes import Processes
@@ -18,9 +19,9 @@ STORE_FILE = "samples.sqlite"
 
 
 def evaluate(
-    suites: Sequence[Suite], setup: Setup, out: Path, workers: int, ray: str | None, arguments: Sequence[str]
+    suites: Sequence[Suite], setup: Setup, out: Path, workers: int | None, ray: str | None, arguments: Sequence[str]
 ) -> None:
-    """Run what is missing of ``suites`` with ``workers`` processes, or on the Ray cluster at the address ``ray``.
+    """Run what is missing of ``suites`` with ``workers`` processes (one), or on the Ray cluster at the address ``ray``.
 
     ``arguments`` are the words of the command, noted in the run's folder.
     """
@@ -45,5 +46,5 @@ def evaluate(
     screen.say(f"rows: {out / EPISODES_FILE}; all of it: {out / PAGE_FILE}")
 
 
-def _hands(workers: int, ray: str | None) -> Hands:
-    return Processes(workers)
+def _hands(workers: int | None, ray: str | None) -> Hands:
+    return Processes(workers or 1) if ray is None else Cluster(ray, workers)

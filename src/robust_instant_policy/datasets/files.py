@@ -69,7 +69,7 @@ def lock_folder(path: Path) -> int:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         os.close(descriptor)
-        raise DatasetError(f"another process is recording into {path}; wait for it or choose another folder") from error
+        raise DatasetError(f"another process is writing into {path}; wait for it or choose another folder") from error
     return descriptor
 
 

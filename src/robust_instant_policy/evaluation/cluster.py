@@ -25,10 +25,10 @@ LOOK_SECONDS = 2.0  # between two looks at whether a worker can be had by now
 
 @dataclass(frozen=True)
 class Cluster:
-    """Up to ``count`` workers on the Ray cluster at ``address`` ("auto": the one this machine belongs to)."""
+    """Up to ``count`` workers (None: one a core) on the Ray cluster at ``address`` ("auto": this machine's)."""
 
     address: str
-    count: int
+    count: int | None = None
 
     def __call__(self, setup: Setup, works: list[SceneWork]) -> Iterator[Outcome]:
         """Do ``works``. A scene whose worker is lost, with its machine or alone, is done again elsewhere.
@@ -52,8 +52,8 @@ class Cluster:
             team = _Team(setup, _most_demonstrations(setup, works))
             at_work: dict[Any, _Member] = {}
             while agenda or at_work:
-                wanted = min(self.count, len(agenda) + len(at_work))
-                team.grow(wanted)
+                wanted = len(agenda) + len(at_work)
+                team.grow(wanted if self.count is None else min(wanted, self.count))
                 for member in team.free(at_work.values()):
                     work = agenda.next(member.task, [other.task for other in at_work.values()])
                     if work is not None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from robust_instant_policy.datasets.files import write_whole
+from robust_instant_policy.datasets.files import lock_folder, make_folder, write_whole
 from robust_instant_policy.evaluation.episodes import Episode, open_episodes
 from robust_instant_policy.evaluation.failures import Failure, open_failures, video_file
 from robust_instant_policy.evaluation.scenes import count_demonstrations, obtain_demonstrations
@@ -35,7 +36,8 @@ def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, p
     Demonstrations are kept in ``setup.data/TASK`` and recorded where they are missing. What several suites ask for is
     done once, and everything in one scene together, so that its samples are asked for once.
     """
-    with closing(open_episodes(out)) as episodes, closing(open_failures(out)) as failures:
+    make_folder(out)
+    with _one_writer(out), closing(open_episodes(out)) as episodes, closing(open_failures(out)) as failures:
         wanted = wanted_plans(suites)
         left = executions_left(episodes.rows)
         done = sum(left.get(plan) == 0 for plan in wanted)
@@ -61,6 +63,15 @@ def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, p
                     write_whole(out / video_file(failure.scene, failure.variant, failure.candidate), outcome.video)
                 failures.add(failure)
             progress.outcome(done, len(wanted), outcome)
+
+
+@contextmanager
+def _one_writer(out: Path) -> Iterator[None]:
+    descriptor = lock_folder(out)
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def wanted_plans(suites: Iterable[Suite]) -> list[Plan]:
