@@ -27,7 +27,12 @@ class Family:
 
 FAMILIES = (
     Family("maniskill", "sim", "", ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")),
-    Family("aloha", "aloha", "aloha-", ("aloha-pick-banana", "aloha-pick-place", "aloha-cup-upright")),
+    Family(
+        "aloha",
+        "aloha",
+        "aloha-",
+        ("aloha-pick-banana", "aloha-hang", "aloha-cup-upright", "aloha-sweep", "aloha-pick-place"),
+    ),
 )
 TASK_NAMES = tuple(name for family in FAMILIES for name in family.names)
 

@@ -181,12 +181,10 @@ def plan_poses(
     before = Motion.at_home(arm) if before is None else before
     steps = np.arange(len(poses)) if steps is None else steps
     path = arm.kinematics.follow(poses, before.joints[-1])
-    _refuse(
-        (path.position_error > REACH_TOLERANCE_M) | (path.rotation_error > arm.turn_tolerance),
-        "a pose the arm cannot reach, it stays {:.0f} mm short",
-        path.position_error * 1e3,
-        steps,
-    )
+    short, turned = path.position_error, path.rotation_error
+    _refuse(short > REACH_TOLERANCE_M, "a pose the arm cannot reach, it stays {:.0f} mm short", short * 1e3, steps)
+    turned_deg = np.rad2deg(turned)
+    _refuse(turned > arm.turn_tolerance, "a pose the arm cannot reach, it stays {:.0f} degrees off", turned_deg, steps)
     change = np.abs(np.diff(path.joints, axis=0, prepend=before.joints[-1:])).max(axis=1)
     _refuse(change > FLIP_RAD, "an elbow or wrist that flips by {:.0f} degrees at once", np.rad2deg(change), steps)
     count = np.maximum(np.ceil(change * rate_hz / arm.joint_speed), 1).astype(int)

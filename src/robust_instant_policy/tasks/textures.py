@@ -10,6 +10,7 @@ Color = tuple[float, float, float]
 GRAIN_PIXELS = 128
 GRAIN_LINES = 9  # across a face
 GRAIN_CONTRAST = 0.16
+BRISTLE_CONTRAST = 0.25
 
 LAMINATE: Color = (0.80, 0.80, 0.78)
 LAMINATE_PIXELS = 512
@@ -33,3 +34,11 @@ def laminate(rng: np.random.Generator) -> NDArray[np.uint8]:
     """The light grey, slightly speckled top of a laboratory table."""
     speckle = rng.normal(0.0, 1.0, (LAMINATE_PIXELS, LAMINATE_PIXELS, 1))
     return (np.clip(np.array(LAMINATE) * (1 + LAMINATE_CONTRAST * speckle), 0.0, 1.0) * 255).astype(np.uint8)
+
+
+def bristles(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Tufts along the image's columns."""
+    shade = 1 + BRISTLE_CONTRAST * rng.normal(0.0, 1.0, (1, GRAIN_PIXELS, 1))
+    return np.broadcast_to(
+        (np.clip(np.array(color) * shade, 0.0, 1.0) * 255).astype(np.uint8), (GRAIN_PIXELS, GRAIN_PIXELS, 3)
+    ).copy()

@@ -52,7 +52,7 @@ STILL_RAD_S = 0.2  # joint speed below which an arm is at rest, as in the tasks 
 STILL_M_S = 0.02  # and an object
 HELD_N = 0.5  # force of each finger from which something is held
 
-WORKSPACE = np.array([[-0.30, -0.32, -0.005], [0.18, 0.32, 0.4]])
+WORKSPACE = np.array([[-0.30, -0.32, -0.005], [0.22, 0.32, 0.4]])
 
 
 class AlohaEnv(gymnasium.Env):

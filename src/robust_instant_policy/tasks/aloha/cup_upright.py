@@ -7,12 +7,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.tasks.aloha.cell import AlohaEnv
 from robust_instant_policy.tasks.aloha.cup import Cup
-from robust_instant_policy.tasks.aloha.robot import BASE_X_M
+from robust_instant_policy.tasks.aloha.hands import back, bearing, grip, over
 from robust_instant_policy.tasks.demonstrator import Stroke
-from robust_instant_policy.tasks.poses import facing, pitched
+from robust_instant_policy.tasks.poses import facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.14, -0.02), (-0.13, 0.13)
@@ -55,42 +54,20 @@ def stand_up(env: CupUprightEnv, rng: np.random.Generator) -> list[Stroke]:
     axis = lying[:3, 2]
     yaw, rise = float(np.arctan2(axis[1], axis[0])), float(np.arcsin(axis[2]))
     middle = lying[:3, 3] + HOLD_SHARE * env.cup.height * axis
-    hold = _grip(middle, PITCH_RAD, yaw)
-    # A hand in line with its forearm turns up without effort; at an angle to it, the forearm would have to roll over.
-    lifted = _grip(_over(middle, LIFT_M), PITCH_RAD + TURN_FIRST_RAD, _bearing(middle))
+    hold = grip(middle, PITCH_RAD, yaw, BEYOND_M)
+    lifted = grip(over(middle, LIFT_M), PITCH_RAD + TURN_FIRST_RAD, bearing(middle), BEYOND_M)
     upright = PITCH_RAD + np.pi / 2 - rise
     stand = middle + FORWARD_M * np.array([np.cos(yaw), np.sin(yaw), 0.0])
     stand[2] = SET_DOWN_M + HOLD_SHARE * env.cup.height
-    over = _grip(_over(stand, OVER_M), upright, _bearing(stand))
-    end = _grip(stand, upright, _bearing(stand))
+    above = grip(over(stand, OVER_M), upright, bearing(stand), BEYOND_M)
+    end = grip(stand, upright, bearing(stand), BEYOND_M)
     return [
-        Stroke(_back(hold, APPROACH_M)[None], closed=False, free=True, speed=0.20, error=0.003),
+        Stroke(back(hold, APPROACH_M)[None], closed=False, free=True, speed=0.20, error=0.003),
         Stroke(hold[None], closed=True, speed=0.08, error=0.0015),
-        Stroke(np.array([lifted, over]), closed=True, speed=0.14, error=0.003, pause=0.2),
+        Stroke(np.array([lifted, above]), closed=True, speed=0.14, error=0.003, pause=0.2),
         Stroke(end[None], closed=False, speed=0.05, error=0.001, pause=0.3),
-        Stroke(_back(end, APPROACH_M)[None], closed=False, speed=0.10, error=0.002),
+        Stroke(back(end, APPROACH_M)[None], closed=False, speed=0.10, error=0.002),
     ]
-
-
-def _grip(middle: FloatArray, pitch: float, yaw: float) -> FloatArray:
-    """Tool pose ``(4, 4)`` of a hand whose fingers reach a little past the cup's ``middle (3,)``."""
-    hand = pitched(pitch, yaw)
-    return make_pose(hand, middle + BEYOND_M * hand[:, 2])
-
-
-def _over(point: FloatArray, height: float) -> FloatArray:
-    """``point (3,)`` raised by ``height`` metres."""
-    return point + np.array([0.0, 0.0, height])
-
-
-def _bearing(point: FloatArray) -> float:
-    """Direction, in rad, in which the working arm sees ``point (3,)``."""
-    return float(np.arctan2(point[1], point[0] + BASE_X_M))
-
-
-def _back(pose: FloatArray, distance: float) -> FloatArray:
-    """``pose`` drawn back along its approach, in metres."""
-    return make_pose(pose[:3, :3], pose[:3, 3] - distance * pose[:3, 2])
 
 
 def verdict(env: CupUprightEnv) -> str:

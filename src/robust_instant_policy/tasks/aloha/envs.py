@@ -8,6 +8,8 @@ MAX_EPISODE_STEPS = 3000  # a minute
 ENVIRONMENTS = {
     "RIP-AlohaPickBanana-v1": "pick_banana:PickBananaEnv",
     "RIP-AlohaPickPlace-v1": "pick_place:PickPlaceEnv",
+    "RIP-AlohaHang-v1": "hang:HangEnv",
+    "RIP-AlohaSweep-v1": "sweep:SweepEnv",
     "RIP-AlohaCupUpright-v1": "cup_upright:CupUprightEnv",
 }
 

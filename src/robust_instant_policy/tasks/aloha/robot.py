@@ -32,19 +32,19 @@ TOOL_LENGTH_M = 0.1537  # from the axis that turns the wrist to the tips of the 
 CLOSED_M = 0.0224  # reading of a finger's joint at which the pads touch
 FINGER_TRAVEL_M = 0.057 - CLOSED_M
 FINGER_SPEED_M_S = 0.10
-GRIP_FORCE_N = 15.0  # of each finger: ALOHA limits the gripper servo's current
+GRIP_FORCE_N = 25.0  # of each finger: ALOHA limits the gripper servo's current
 PAD_FRICTION = 1.2  # grip tape
 PAD_TORSION_M, PAD_ROLLING_M = 0.01, 1e-3
 
 SERVO_TORQUE_NM = (10.6, 21.2, 21.2, 10.6, 10.6, 4.1)  # XM540-W270, two of them at shoulder and elbow, XM430-W350
 JOINT_SPEED_LIMIT_RAD_S = 0.8 * np.pi  # XM540-W270: 30 rev/min without load
 TOOL_SPEED_LIMIT_M_S = 0.6
-TURN_TOLERANCE_RAD = 0.1  # where hand and forearm come into line, which is in the middle of this arm's range
+TURN_TOLERANCE_RAD = 0.15  # where hand and forearm come into line, which is in the middle of this arm's range
 RELUCTANCE_M, ORIENTATION_COST_M = 0.008, 0.05
 STIFFNESS = (300.0, 500.0, 400.0, 60.0, 60.0, 30.0)  # N m/rad: 5 mm into the table press with some 10 N
 LAG_S = 0.03
 ARMATURE = 0.02  # kg m², the rotors' inertia seen through their gears
-FINGER_STIFFNESS = 2e3  # N/m
+FINGER_STIFFNESS = 8e3  # N/m: what is thicker than a few millimetres is held with the full force
 
 HOME_JOINTS = (-1.4, -0.43, 0.434, 0.0, 1.567, 0.0)  # hand down, beside the arm, out of the camera's sight
 PARKED_JOINTS = (0.0, -1.8, 1.6, 0.0, 0.3, 0.0)

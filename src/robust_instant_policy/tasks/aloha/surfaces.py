@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mujoco
@@ -74,6 +74,38 @@ def box_surface(size: ArrayLike) -> Surface:
             faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     return Surface(np.reshape(vertices, (-1, 3)), np.array(faces), np.tile(corners, (6, 1)))
+
+
+def moved(surface: Surface, offset: ArrayLike) -> Surface:
+    """``surface`` shifted by ``offset (3,)`` metres."""
+    return replace(surface, vertices=surface.vertices + np.asarray(offset, dtype=np.float64))
+
+
+def tube(points: ArrayLike, radius: float, sides: int = 14) -> Surface:
+    """A round bar of ``radius`` along ``points (N, 3)``, closed at its ends; u runs around it, v along it."""
+    points = np.asarray(points, dtype=np.float64)
+    tangents = np.gradient(points, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    across = np.cross(tangents, np.where(np.abs(tangents[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    angles = np.linspace(0.0, 2 * np.pi, sides + 1)[:, None, None]
+    rings = points + radius * (np.cos(angles) * across + np.sin(angles) * np.cross(tangents, across))
+    tips = np.broadcast_to(points[[0, -1]] + radius * tangents[[0, -1]] * [[-1], [1]], (sides + 1, 2, 3))
+    rows = np.concatenate([tips[:, :1], rings, tips[:, 1:]], axis=1)
+    return _sheet(rows, np.linspace(0.0, 1.0, sides + 1), np.linspace(0.0, 1.0, rows.shape[1]))
+
+
+def _sheet(rows: FloatArray, u: FloatArray, v: FloatArray) -> Surface:
+    """Triangles between neighbours of a grid of points ``rows (U, V, 3)``."""
+    count = rows.shape[1]
+    first = (np.arange(len(rows) - 1)[:, None] * count + np.arange(count - 1)).ravel()
+    faces = np.concatenate(
+        [
+            np.stack([first, first + count, first + count + 1], axis=1),
+            np.stack([first, first + count + 1, first + 1], axis=1),
+        ]
+    )
+    return Surface(rows.reshape(-1, 3), faces, np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
 
 
 def add_surface(spec: mujoco.MjSpec, body: Body, name: str, surface: Surface, image: Image, shine: float = 0.2) -> None:

@@ -1,0 +1,110 @@
+"""What one sweeps with: a hand brush with an upright handle, and a dustpan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.tasks.aloha.surfaces import (
+    Body,
+    add_solid,
+    add_surface,
+    box_surface,
+    fixed_body,
+    free_body,
+    moved,
+    paint,
+)
+from robust_instant_policy.tasks.textures import Color, bristles, wood
+
+BOX = mujoco.mjtGeom.mjGEOM_BOX
+BRISTLE_FRICTION, WOOD_FRICTION, PAN_FRICTION = 0.25, 0.7, 0.3
+BEECH: Color = (0.72, 0.52, 0.30)
+BRISTLES: Color = (0.16, 0.15, 0.15)
+PAN_BLUE: Color = (0.12, 0.32, 0.62)
+
+
+@dataclass(frozen=True)
+class Brush:
+    """Stands on its bristles on z = 0, its width along y; lengths in metres."""
+
+    seed: int
+    width: float = 0.085
+    depth: float = 0.030
+    bristle_length: float = 0.032
+    handle_height: float = 0.068
+
+    MASS_KG: ClassVar[float] = 0.12
+    BACK_M: ClassVar[float] = 0.012
+    HANDLE_M: ClassVar[tuple[float, float]] = (0.020, 0.024)
+    # Bristles bend: they press with a few newtons when they are some millimetres too low.
+    SOFT: ClassVar[dict] = dict(priority=1, solref=[0.045, 1.0], solimp=[0.2, 0.9, 0.008, 0.5, 2.0])
+
+    @property
+    def height(self) -> float:
+        return self.bristle_length + self.BACK_M + self.handle_height
+
+    def build(self, spec: mujoco.MjSpec, name: str, pose: FloatArray) -> Body:
+        """Add the brush to ``spec`` at ``pose (4, 4)``."""
+        body = free_body(spec, name, pose)
+        rng = np.random.default_rng(self.seed)
+        grain = wood(BEECH, rng)
+        back = self.bristle_length + self.BACK_M / 2
+        handle = self.bristle_length + self.BACK_M + self.handle_height / 2
+        tufts = (self.depth, self.width, self.bristle_length)
+        parts = (
+            ("bristles", tufts, self.bristle_length / 2, bristles(BRISTLES, rng)),
+            ("back", (self.depth + 0.006, self.width + 0.006, self.BACK_M), back, grain),
+            ("handle", (*self.HANDLE_M, self.handle_height), handle, grain),
+        )
+        for (part, size, height, image), mass in zip(parts, (0.3, 0.4, 0.3), strict=True):
+            place = (0.0, 0.0, height)
+            add_surface(spec, body, f"{name}-{part}", moved(box_surface(size), place), image, shine=0.1)
+            touch = dict(friction=BRISTLE_FRICTION, **self.SOFT) if part == "bristles" else dict(friction=WOOD_FRICTION)
+            add_solid(body, BOX, np.array(size) / 2, position=place, mass=mass * self.MASS_KG, **touch)
+        return body
+
+
+@dataclass(frozen=True)
+class Dustpan:
+    """Lies on z = 0, its lip along y at x = 0, the pan behind it along x; lengths in metres. Held to the table."""
+
+    width: float = 0.17
+    depth: float = 0.11
+    wall: float = 0.030
+    lip: float = 0.020
+    floor: float = 0.003
+
+    THICKNESS_M: ClassVar[float] = 0.004
+
+    def build(self, spec: mujoco.MjSpec, name: str, pose: FloatArray) -> Body:
+        """Add the dustpan to ``spec`` at ``pose (4, 4)``."""
+        body = fixed_body(spec, name, pose)
+        t, half = self.THICKNESS_M, self.width / 2
+        inside, middle = self.depth - self.lip, (self.depth + self.lip) / 2
+        boxes = (
+            ("floor", (inside, self.width, self.floor), (middle, 0, self.floor / 2)),
+            ("back", (t, self.width, self.wall), (self.depth, 0, self.wall / 2)),
+            ("left", (inside, t, self.wall), (middle, half, self.wall / 2)),
+            ("right", (inside, t, self.wall), (middle, -half, self.wall / 2)),
+            ("handle", (0.06, 0.03, 0.02), (self.depth + 0.03, 0, 0.02)),
+        )
+        for part, size, place in boxes:
+            shade = np.array(PAN_BLUE) * (1.25 if part == "floor" else 1.0)
+            add_surface(spec, body, f"{name}-{part}", moved(box_surface(size), place), paint(shade), shine=0.3)
+            add_solid(body, BOX, np.array(size) / 2, position=place, friction=PAN_FRICTION)
+        corners = [(x, y, z) for y in (-half, half) for x, z in ((0, 0), (self.lip, 0), (self.lip, self.floor))]
+        ramp = spec.add_mesh(name=f"{name}-ramp")
+        ramp.uservert = np.array(corners, dtype=np.float32).ravel()
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=f"{name}-ramp",
+            rgba=[*(1.25 * np.array(PAN_BLUE)), 1.0],
+            friction=[PAN_FRICTION, 5e-3, 2e-4],
+            condim=6,
+        )
+        return body

@@ -1,0 +1,121 @@
+"""Sweep something into a dustpan with a brush that touches the table."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
+from robust_instant_policy.tasks.aloha.broom import Brush, Dustpan
+from robust_instant_policy.tasks.aloha.cell import CONTROL_HZ, AlohaEnv
+from robust_instant_policy.tasks.aloha.dust import Dust
+from robust_instant_policy.tasks.demonstrator import Stroke
+from robust_instant_policy.tasks.object_sets import draw_object
+from robust_instant_policy.tasks.poses import downward, facing
+from robust_instant_policy.tasks.simulated_task import TaskSpec
+
+BRUSH_X_RANGE_M, BRUSH_Y_RANGE_M = (-0.24, -0.20), (0.17, 0.21)
+DUST_X_RANGE_M, DUST_Y_RANGE_M = (-0.15, -0.05), (-0.12, 0.08)
+PAN_X_RANGE_M, PAN_Y_RANGE_M = (0.045, 0.065), (-0.03, 0.03)
+BRUSH_YAW_RAD, PAN_YAW_RAD = np.deg2rad(8), np.deg2rad(8)
+
+TOUCHED_SECONDS = 0.3  # for which the held brush has to touch the table
+
+HOLD_M = 0.052  # of the handle's length, from its top
+ABOVE_M = 0.05
+LIFT_M = 0.06
+BEHIND_M = 0.045  # of the dust's near side, where the brush comes down
+PRESS_M = 0.002  # of the bristles into the table
+INTO_M = 0.040  # past the lip: how far the brush goes
+AIM_SHARE = 0.35  # of the dust's offset from the pan's middle that is left at the lip
+
+
+class SweepEnv(AlohaEnv):
+    """Success: the object lies in the dustpan, swept there by a brush that touched the table."""
+
+    dust: Dust
+    brush: Brush
+    pan: Dustpan
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        families = {"seen": Dust.draw_seen, "unseen": Dust.draw_unseen}
+        self.dust = draw_object(families, self.objects, self.draw("shape"))
+        self.brush, self.pan = Brush(seed=int(self.draw("brush").integers(2**31))), Dustpan()
+        rng = self.draw("pose")
+        things = (
+            (self.brush, "brush", BRUSH_X_RANGE_M, BRUSH_Y_RANGE_M, BRUSH_YAW_RAD),
+            (self.dust, "dust", DUST_X_RANGE_M, DUST_Y_RANGE_M, np.pi),
+            (self.pan, "dustpan", PAN_X_RANGE_M, PAN_Y_RANGE_M, PAN_YAW_RAD),
+        )
+        for thing, name, x, y, yaw in things:
+            thing.build(spec, name, facing(rng.uniform(*x), rng.uniform(*y), rng.uniform(-yaw, yaw)))
+        self._touched = 0.0
+
+    def advance(self, command: FloatArray) -> None:
+        super().advance(command)
+        if self.touch("brush", "world") > 0 and self.is_held("brush"):
+            self._touched += 1 / CONTROL_HZ
+
+    def evaluate(self) -> dict[str, Any]:
+        x, y, z = transform_points(invert_pose(self.pose_of("dustpan")), self.pose_of("dust")[:3, 3])
+        inside = self.pan.lip < x < self.pan.depth and abs(y) < self.pan.width / 2 and z < self.pan.wall
+        touched = self._touched >= TOUCHED_SECONDS
+        return {"success": bool(inside and touched), "inside": bool(inside), "touched": touched, "short": -float(x)}
+
+
+def sweep(env: SweepEnv, rng: np.random.Generator) -> list[Stroke]:
+    """Take the brush by its handle, set it down behind the dust, push that over the lip, and lift the brush."""
+    brush, dust, pan = (env.pose_of(name) for name in ("brush", "dust", "dustpan"))
+    yaw = float(np.arctan2(brush[1, 0], brush[0, 0]))
+    hold = env.brush.height - HOLD_M
+    x, y = brush[:2, 3].tolist()
+
+    lip = transform_points(pan, [0.0, AIM_SHARE * transform_points(invert_pose(pan), dust[:3, 3])[1], 0.0])
+    push = lip - dust[:3, 3]
+    along = float(np.arctan2(push[1], push[0]))
+    ahead = np.array([np.cos(along), np.sin(along)])
+    reach = max(env.dust.size[:2]) / 2 + env.brush.depth / 2
+    start = dust[:2, 3] - (reach + BEHIND_M) * ahead
+    stop = lip[:2] + (INTO_M - env.brush.depth / 2) * ahead
+
+    def at(place: FloatArray, height: float) -> FloatArray:
+        return downward(float(place[0]), float(place[1]), height, along)
+
+    return [
+        Stroke(np.array([downward(x, y, env.brush.height + ABOVE_M, yaw)]), closed=False, free=True, error=0.003),
+        Stroke(np.array([downward(x, y, hold, yaw)]), closed=True, speed=0.10, error=0.0015),
+        Stroke(np.array([downward(x, y, hold + LIFT_M, yaw)]), closed=True, speed=0.12, error=0.003),
+        Stroke(at(start, hold + LIFT_M)[None], closed=True, speed=0.20, error=0.004),
+        Stroke(at(start, hold - PRESS_M)[None], closed=True, speed=0.10, error=0.0015, pause=0.2),
+        Stroke(
+            np.array([at(lip[:2] - 0.5 * env.brush.depth * ahead, hold - PRESS_M), at(stop, hold + env.pan.floor)]),
+            closed=True,
+            speed=0.09,
+            error=0.0015,
+            pause=0.2,
+        ),
+        Stroke(at(stop, hold + LIFT_M)[None], closed=True, speed=0.12, error=0.004),
+    ]
+
+
+def verdict(env: SweepEnv) -> str:
+    """Why the task failed, or nothing."""
+    state = env.evaluate()
+    if state["success"]:
+        return ""
+    if not state["inside"]:
+        return f"the object is not in the dustpan, but {1e3 * state['short']:.0f} mm before its lip"
+    return "the object is in the dustpan, but the brush hardly touched the table"
+
+
+SPEC = TaskSpec(
+    name="aloha-sweep",
+    description="sweep the object into the dustpan with the brush",
+    goal="the object is in the dustpan",
+    env_id="RIP-AlohaSweep-v1",
+    expert=sweep,
+    verdict=verdict,
+    object_sets=("seen", "unseen"),
+)
