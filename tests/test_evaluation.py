@@ -3,6 +3,8 @@
 import math
 from fractions import Fraction
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -114,15 +116,21 @@ def test_a_kill_at_any_moment_loses_no_row(tmp_path):
 
 
 def test_a_damaged_or_older_table_is_refused_in_one_line(tmp_path):
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     (tmp_path / "episodes.parquet").write_bytes(b"PAR1 half a file")
     with pytest.raises(DatasetError, match="move it away"):
         open_episodes(tmp_path)
     pq.write_table(pa.table({"task": ["push-cube"], "method": ["rip"]}), tmp_path / "episodes.parquet")
     with pytest.raises(DatasetError, match="--replay"):
         open_episodes(tmp_path)
+
+
+def test_a_setting_that_came_after_a_file_was_written_has_its_default(tmp_path):
+    table = open_episodes(tmp_path)
+    table.add(episode(RIP, 1, True))
+    table.close()
+    path = tmp_path / "episodes.parquet"
+    pq.write_table(pq.read_table(path).drop_columns(["features"]), path)
+    assert open_episodes(tmp_path).rows == [episode(RIP, 1, True)]
 
 
 def test_work_goes_on_with_the_executions_that_are_missing(tmp_path):

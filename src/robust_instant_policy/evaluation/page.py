@@ -10,7 +10,6 @@ from pathlib import Path
 
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import Failure, video_file
-from robust_instant_policy.evaluation.manifest import Manifest, Session
 from robust_instant_policy.evaluation.tables import Table
 
 TITLES = {
@@ -45,7 +44,7 @@ h1{font-size:1.6em}h2{margin-top:2em;border-bottom:1px solid #ccc}
 table{border-collapse:collapse;font-size:.85em;margin:1em 0;display:block;overflow-x:auto}
 td,th{border-bottom:1px solid #ddd;padding:.25em .6em;text-align:right;white-space:nowrap}
 td:first-child,th:first-child{text-align:left}
-table.words td,table.words th{text-align:left;white-space:normal}
+td:has(code){white-space:normal;min-width:24em}
 figure{margin:1em 0}figure img{max-width:100%}figcaption,.note{color:#666;font-size:.85em;max-width:60em}
 .films{display:grid;grid-template-columns:repeat(auto-fill,minmax(250px,1fr));gap:1em}
 .films figure{margin:0;border:1px solid #ddd;padding:.5em}.films video{width:100%;background:#eee;aspect-ratio:4/3}
@@ -74,11 +73,11 @@ class Section:
 
 def write_page(
     folder: Path,
-    manifest: Manifest,
     sections: Sequence[Section],
     episodes: Sequence[Episode],
     failures: Iterable[Failure],
     failure_table: Table,
+    sessions: Table,
 ) -> str:
     """The page as text; films of failed episodes are taken from ``folder``."""
     lost = [row for row in episodes if not row.success]
@@ -97,7 +96,7 @@ def write_page(
         failure_table.html(),
         _gallery(folder, lost, {failure.key: failure for failure in failures}),
         "<h2 id=run>What was run</h2>",
-        _sessions(manifest.sessions, episodes),
+        sessions.html(),
         "</html>",
     ]
     return "\n".join(parts)
@@ -142,23 +141,4 @@ def _card(folder: Path, row: Episode, failure: Failure | None) -> str:
     return (
         f"<figure>{film}<figcaption><b>{html.escape(row.failure)}</b><br>{html.escape(words)}<br>"
         f"{html.escape(str(row.variant))}, scene {row.scene.seed}{objects}{which}</figcaption></figure>"
-    )
-
-
-def _sessions(sessions: Sequence[Session], episodes: Sequence[Episode]) -> str:
-    rows = "".join(
-        f"<tr><td><code>{html.escape(one.command)}</code></td><td>{html.escape(one.began)}</td>"
-        f"<td>{one.hours:.2f}</td><td>{html.escape(one.machine)}</td><td>{html.escape(one.code)}</td></tr>"
-        for one in sessions
-    )
-    models = sorted({row.variant.model for row in episodes if row.variant.model})
-    planning = sum(row.seconds for row in episodes if row.candidate == 0)
-    physics = sum(row.physics_seconds for row in episodes)
-    return (
-        f"<p>Language model: {html.escape(', '.join(models) or 'none was asked')}. "
-        f"{sum(one.hours for one in sessions):.1f} hours in all, in the sessions below; planning took "
-        f"{planning / 3600:.1f} hours of it (samples that were stored already cost next to nothing) and physics "
-        f"{physics / 3600:.1f}.</p>"
-        "<table class=words><tr><th>command</th><th>began (UTC)</th><th>hours</th><th>machine</th><th>code</th></tr>"
-        f"{rows}</table>"
     )

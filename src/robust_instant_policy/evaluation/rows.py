@@ -7,7 +7,7 @@ import json
 import os
 import time
 from collections.abc import Hashable
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from pathlib import Path
 from typing import IO, Any, Generic, Protocol, TypeVar, get_type_hints
 
@@ -44,7 +44,8 @@ class RowFile(Generic[R]):
     """The rows of ``path``, each added once.
 
     A row is on disk when `add` returns: in the parquet file itself, or in a journal beside it (one line of JSON a row)
-    that is folded into it every few seconds, on `close`, and when the file is next opened.
+    that is folded into it every few seconds, on `close`, and when the file is next opened. A column that a file lacks
+    because it is older has the default of its field.
     """
 
     def __init__(self, kind: type[R], path: str | Path):
@@ -109,12 +110,17 @@ class RowFile(Generic[R]):
             table = pq.read_table(self.path)
         except (pa.ArrowException, OSError) as error:
             raise DatasetError(f"{self.path} cannot be read ({error}); move it away to start again") from None
-        if table.schema.names != self._schema.names:
+        known = _defaults(self._kind)
+        for name in set(self._schema.names) - set(table.schema.names):
+            if name in known:  # a setting that came after the file was written
+                column = pa.array([known[name]] * len(table), self._schema.field(name).type)
+                table = table.append_column(name, column)
+        if set(table.schema.names) != set(self._schema.names):
             raise DatasetError(
                 f"{self.path} has other columns than this version writes; move it away and run again with --replay, "
                 "which makes its rows anew from the stored samples"
             )
-        return table.cast(self._schema)
+        return table.select(self._schema.names).cast(self._schema)
 
     def _recover(self) -> None:
         """Fold in what a killed run left in its journal; its last line may be half a row."""
@@ -140,6 +146,18 @@ def _columns(kind: type) -> list[tuple[str, pa.DataType]]:
         hint = hints[field.name]
         columns += _columns(hint) if is_dataclass(hint) else [(field.name, _TYPES[hint])]  # type: ignore[arg-type]
     return columns
+
+
+def _defaults(kind: type) -> dict[str, Any]:
+    """The columns that need not be there, with the value they then have."""
+    hints = get_type_hints(kind)
+    known: dict[str, Any] = {}
+    for field in fields(kind):
+        if is_dataclass(hints[field.name]):
+            known |= _defaults(hints[field.name])
+        elif field.default is not MISSING:
+            known[field.name] = field.default
+    return known
 
 
 def _flat(row: Any) -> dict[str, Any]:

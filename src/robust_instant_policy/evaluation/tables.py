@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import STAGES, Failure
+from robust_instant_policy.evaluation.manifest import Session
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test
 from robust_instant_policy.evaluation.summary import Rate, Summary, reference
 from robust_instant_policy.evaluation.variant import Variant
@@ -37,7 +38,8 @@ class Table:
 
 
 def _html(cell: str) -> str:
-    return re.sub(r"\*\*(\S.*?)\*\*", r"<b>\1</b>", html.escape(cell)).replace("\\*", "*")
+    text = re.sub(r"\*\*(\S.*?)\*\*", r"<b>\1</b>", html.escape(cell)).replace("\\*", "*")
+    return re.sub(r"`(.+?)`", r"<code>\1</code>", text)
 
 
 def tables(summary: Summary) -> list[Table]:
@@ -163,6 +165,25 @@ def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> T
     )
 
 
+def session_table(sessions: Sequence[Session], episodes: Sequence[Episode]) -> Table:
+    """What was run, where and for how long; sessions of one command are one row."""
+    rows: dict[tuple[str, str, str], list[float]] = {}
+    for one in sessions:
+        rows.setdefault((one.command, one.machine, one.code), []).append(one.hours)
+    models = sorted({row.variant.model for row in episodes if row.variant.model})
+    planning = sum(row.seconds for row in episodes if row.candidate == 0) / 3600
+    physics = sum(row.physics_seconds for row in episodes) / 3600
+    return Table(
+        ("command", "machine", "version", "sessions", "hours"),
+        tuple((f"`{key[0]}`", *key[1:], str(len(hours)), f"{sum(hours):.2f}") for key, hours in rows.items()),
+        f"Language model: {', '.join(models) or 'none was asked'}. First session: {sessions[0].began}. The workers "
+        f"planned for {planning:.1f} hours (samples that were stored already cost next to nothing) and executed for "
+        f"{physics:.1f}."
+        if sessions
+        else "Nothing is known of the commands that wrote these rows.",
+    )
+
+
 def _name(variant: Variant, summary: Summary) -> str:
     same = [other for other in summary.variants if other.method == variant.method]
     return variant.method if len(same) == 1 else str(variant)
@@ -237,5 +258,5 @@ _TABLES: dict[str, Callable[[Summary], list[Table]]] = {
     "queries": lambda summary: [sweep_table(summary, "Q", lambda variant: str(variant.queries))],
     "dof": lambda summary: [sweep_table(summary, "ν", _dof)],
     "downsampling": _downsampling,
-    "trajectories": lambda summary: [success_table(summary)],
+    "trajectories": lambda summary: [],
 }
