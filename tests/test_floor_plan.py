@@ -17,7 +17,7 @@ FLOORS = {
     "perception": 2, "context": 2, "llm": 2, "regression": 2, "datasets": 2,
     "policies": 3, "tasks": 3,
     "evaluation": 4,
-    "cli": 5, "report": 5, "demo": 5, "doctor": 5, "console": 5, "evaluate": 5, "keypoints": 5,
+    "cli": 5, "report": 5, "demo": 5, "doctor": 5, "console": 5, "evaluate": 5, "train": 5, "keypoints": 5,
 }  # fmt: skip
 
 

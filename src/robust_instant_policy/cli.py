@@ -15,6 +15,7 @@ from robust_instant_policy.errors import RipError, UsageError
 Command = Callable[[argparse.Namespace], int]
 DEFAULT_DATA = Path("data")
 DEFAULT_RUNS = Path("runs")
+DEFAULT_CHECKPOINTS = Path("checkpoints")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -114,12 +115,28 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--objects", choices=("seen", "unseen"), default="seen", help="test with objects like those shown, or others"
     )
+    evaluate.add_argument("--steps", type=_positive, metavar="N", help="how long dp and kat-dp are trained")
+    evaluate.add_argument(
+        "--checkpoints", type=Path, default=DEFAULT_CHECKPOINTS, metavar="DIR", help="where trained weights are"
+    )
     evaluate.add_argument("--replay", action="store_true", help="answer from the stored samples only, without a model")
     evaluate.add_argument("--workers", type=_positive, metavar="N", help="default: 1, or a Ray cluster's cores")
     evaluate.add_argument("--ray", metavar="ADDRESS", help="work on the Ray cluster at this address ('auto': this one)")
     evaluate.add_argument("--no-videos", action="store_true", help="do not film failed episodes once more")
     evaluate.add_argument("--out", type=Path, required=True, metavar="DIR")
     _method_options(evaluate)
+
+    train = command("train", _train, "train dp or kat-dp on demonstrations; goes on where it stopped")
+    train.add_argument("--task", required=True)
+    train.add_argument("--method", required=True, metavar="METHOD", help="dp or kat-dp")
+    train.add_argument("--demos", type=Path, required=True, metavar="DIR", help="dp needs images along the way")
+    train.add_argument("--limit", type=_positive, metavar="N", help="show it the first N of them only")
+    train.add_argument("--steps", type=_positive, metavar="N", help="of gradient descent")
+    train.add_argument("--seed", type=_natural, default=0)
+    train.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where there is one")
+    train.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="rip eval --checkpoints DIR finds it there"
+    )
 
     report = command("report", _report, "write the report of a run, or of an evaluation, again")
     report.add_argument("folder", type=Path, metavar="DIR")
@@ -245,6 +262,7 @@ def _eval(options: argparse.Namespace) -> int:
     from robust_instant_policy.evaluate import STORE_FILE, evaluate
     from robust_instant_policy.evaluation import Choice, Setup, Variant, make_suites
     from robust_instant_policy.llm import model_name
+    from robust_instant_policy.policies.training import DEFAULT_STEPS
 
     base = Variant(
         "rip",
@@ -255,6 +273,7 @@ def _eval(options: argparse.Namespace) -> int:
         layout=options.layout,
         features=options.features,
         model=model_name(options.llm),
+        steps=options.steps or DEFAULT_STEPS,
     )
     choice = Choice(base, options.tasks, options.methods, options.episodes, options.seed, options.objects)
     setup = Setup(
@@ -264,6 +283,7 @@ def _eval(options: argparse.Namespace) -> int:
         data=DEFAULT_DATA,
         deadline_s=float(options.deadline),
         films=not options.no_videos,
+        checkpoints=options.checkpoints,
     )
     evaluate(
         make_suites(options.suite or ["chosen"], choice),
@@ -273,6 +293,15 @@ def _eval(options: argparse.Namespace) -> int:
         options.ray,
         ["rip", *sys.argv[1:]],
     )
+    return 0
+
+
+def _train(options: argparse.Namespace) -> int:
+    from robust_instant_policy.policies.training import DEFAULT_STEPS, Training
+    from robust_instant_policy.train import train
+
+    training = Training(options.out, options.steps or DEFAULT_STEPS, options.device, options.seed)
+    train(options.task, options.method, options.demos, options.limit, training)
     return 0
 
 

@@ -11,6 +11,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from robust_instant_policy.policies.policy import Stage
 
+TRAINING_LINE_S = 30.0  # between two lines about a training, where there is no terminal to draw a bar on
+
 
 class StageConsole:
     """Prints stages with their times and remembers them in ``stages``."""
@@ -58,3 +60,23 @@ class StageConsole:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+
+class TrainingScreen:
+    """A `policies.training.TrainingReport`: loss and time left, as a bar or, without a terminal, as lines."""
+
+    def __init__(self, screen: StageConsole):
+        self._screen = screen
+        self._last_line = -TRAINING_LINE_S
+
+    def __call__(self, method: str, done: int, total: int, loss: float, seconds_left: float) -> None:
+        what = f"training {method}: loss {loss:.4f}, {_in_words(seconds_left)} left"
+        self._screen.done_so_far(what, done, total)
+        now = time.monotonic()
+        if not self._screen.console.is_terminal and (now - self._last_line > TRAINING_LINE_S or done == total):
+            self._screen.say(f"  {what}, {done} of {total} steps")
+            self._last_line = now
+
+
+def _in_words(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"

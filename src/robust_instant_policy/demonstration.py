@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -85,7 +85,8 @@ class Demonstration:
     """One episode: the observation at its start, the gripper's trajectory, and what is known about it.
 
     ``rate_hz`` is the recording rate, so the episode lasted ``(len(trajectory) - 1) / rate_hz`` seconds.
-    ``info`` holds further facts worth keeping (strings and numbers only).
+    ``info`` holds further facts worth keeping (strings and numbers only). ``frames()`` reads the images
+    ``(H, W, 3)`` uint8 along the way, one for each step of the trajectory, where they were recorded.
     """
 
     observation: Observation
@@ -94,6 +95,7 @@ class Demonstration:
     task: str = ""
     seed: int | None = None
     info: Mapping[str, str | float | int] = field(default_factory=lambda: MappingProxyType({}))
+    frames: Callable[[], Iterator[NDArray[np.uint8]]] | None = field(default=None, repr=False)
 
     @property
     def seconds(self) -> float:

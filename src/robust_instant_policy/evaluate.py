@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from robust_instant_policy.console import StageConsole
+from robust_instant_policy.console import StageConsole, TrainingScreen
 from robust_instant_policy.evaluation import Analysis, Episode, Progress, Setup, Suite, run_suites
 from robust_instant_policy.evaluation.cluster import Cluster
 from robust_instant_policy.evaluation.episodes import EPISODES_FILE
@@ -40,7 +40,7 @@ def evaluate(
         screen.done_so_far("plans executed", done, total)
 
     with session(out, suites, arguments, model_name(setup.llm)), screen.stage("evaluation"):
-        run_suites(suites, setup, out, _hands(workers, ray), Progress(recording, outcome))
+        run_suites(suites, setup, out, _hands(workers, ray), Progress(recording, outcome, TrainingScreen(screen)))
     screen.say("")
     screen.say(publish(out))
     screen.say(f"rows: {out / EPISODES_FILE}; all of it: {out / PAGE_FILE}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,13 @@ def _read_demonstration(folder: Folder, episode: int, task: str) -> Demonstratio
             camera_pose=np.array(row[layout.CAMERA_POSE_COLUMN]).reshape(4, 4),
         )
         return Demonstration(
-            observation, Trajectory.from_actions(actions), folder.rate_hz, task, row[layout.SEED_COLUMN], _info(row)
+            observation,
+            Trajectory.from_actions(actions),
+            folder.rate_hz,
+            task,
+            row[layout.SEED_COLUMN],
+            _info(row),
+            partial(folder.frames, episode, layout.VIDEO_KEY) if layout.VIDEO_KEY in folder.video_keys else None,
         )
     except (InvalidValueError, KeyError, ValueError) as error:
         raise DatasetError(

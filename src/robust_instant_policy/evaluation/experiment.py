@@ -11,10 +11,13 @@ from pathlib import Path
 from robust_instant_policy.datasets.files import lock_folder, make_folder, write_whole
 from robust_instant_policy.evaluation.episodes import Episode, open_episodes
 from robust_instant_policy.evaluation.failures import Failure, open_failures, video_file
-from robust_instant_policy.evaluation.scenes import count_demonstrations, obtain_demonstrations
+from robust_instant_policy.evaluation.scenes import count_demonstrations, demonstrations_folder, obtain_demonstrations
 from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.evaluation.work import Hands, Outcome, Planned, SceneWork, Setup
+from robust_instant_policy.evaluation.workbench import Workbench
+from robust_instant_policy.policies import IMAGE_METHODS, TRAINED_METHODS
+from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.tasks import make_task
 
 Plan = tuple[Scene, Variant]
@@ -23,11 +26,12 @@ Plan = tuple[Scene, Variant]
 @dataclass(frozen=True)
 class Progress:
     """Called as the run goes on: ``recording(task, there, wanted, thrown away)``, ``outcome(plans done, plans wanted,
-    what has just come, or None at the start)``.
+    what has just come, or None at the start)``, and ``training`` while a method is trained.
     """
 
     recording: Callable[[str, int, int, int], None]
     outcome: Callable[[int, int, Outcome | None], None]
+    training: TrainingReport = no_report
 
 
 def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, progress: Progress) -> None:
@@ -47,6 +51,7 @@ def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, p
         if not works:
             return
         _record_missing(works, setup, progress)
+        _train_missing(works, setup, progress)
         for outcome in hands(setup, works):
             if isinstance(outcome, Episode):
                 episodes.add(outcome)
@@ -133,16 +138,35 @@ def missing_work(
 
 
 def _record_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:
-    most: dict[str, int] = {}
+    most: dict[tuple[str, bool], int] = {}
     for work in works:
-        most[work.scene.task] = max(most.get(work.scene.task, 0), work.demos)
-    for name, count in most.items():
-        if count_demonstrations(setup.data / name, name) >= count:
+        needs = {(work.scene.task, False): work.demos}
+        for variant in work.concerned:
+            if variant.method in IMAGE_METHODS:
+                needs[work.scene.task, True] = max(needs.get((work.scene.task, True), 0), variant.demos)
+        most |= {key: max(count, most.get(key, 0)) for key, count in needs.items()}
+    for (name, with_images), count in most.items():
+        folder = demonstrations_folder(setup.data, name, with_images)
+        if count_demonstrations(folder, name) >= count:
             continue
         task = make_task(name)
         try:
             obtain_demonstrations(
-                task, setup.data / name, count, lambda *so_far, name=name: progress.recording(name, *so_far)
+                task, folder, count, lambda *so_far, name=name: progress.recording(name, *so_far), with_images
             )
         finally:
             task.close()
+
+
+def _train_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:
+    """Have checkpoints of everything that is trained, before workers would all train it at once."""
+    trained: dict[tuple[str, Variant], SceneWork] = {}
+    for work in works:
+        for variant in work.concerned:
+            if variant.method in TRAINED_METHODS:
+                trained.setdefault((work.scene.task, variant), work)
+    if not trained:
+        return
+    with closing(Workbench(setup, report=progress.training)) as bench:
+        for (_, variant), work in trained.items():
+            bench.fit(work, variant)

@@ -13,11 +13,17 @@ from robust_instant_policy.tasks.task import Task
 
 FIRST_TEST_SEED = 100_000  # demonstrations draw scenes from 0 on, tests from here on
 SEEDS_A_RUN = 1_000  # apart, so that runs with different --seed share no scene
+IMAGES_HZ = 11.0  # about the rate at which demonstrations with images are recorded; rendering them takes long
 
 
 def scene_seed(seed: int, index: int) -> int:
     """Seed of the ``index``-th test scene of a run with ``--seed seed``."""
     return FIRST_TEST_SEED + seed * SEEDS_A_RUN + index
+
+
+def demonstrations_folder(data: Path, task: str, with_images: bool) -> Path:
+    """Where in ``data`` the demonstrations of ``task`` are kept; with images, the same at a lower rate."""
+    return data / (f"{task}-images" if with_images else task)
 
 
 def count_demonstrations(folder: Path, task: str) -> int:
@@ -29,13 +35,20 @@ def count_demonstrations(folder: Path, task: str) -> int:
 
 
 def obtain_demonstrations(
-    task: Task, folder: Path, count: int, on_progress: Callable[[int, int, int], None] | None = None
+    task: Task,
+    folder: Path,
+    count: int,
+    on_progress: Callable[[int, int, int], None] | None = None,
+    with_images: bool = False,
 ) -> list[Demonstration]:
     """The first ``count`` demonstrations of ``task`` in ``folder``, recorded now where they are not there yet.
 
-    ``on_progress`` receives (episodes there, episodes wanted, attempts thrown away).
+    Those ``with_images`` along the way are recorded at about `IMAGES_HZ`. ``on_progress`` receives (episodes there,
+    episodes wanted, attempts thrown away).
     """
     if count_demonstrations(folder, task.name) < count:
-        with DatasetWriter(folder, task=task.name, description=task.description, rate_hz=task.record_hz) as writer:
-            record(task, writer, count, on_progress=on_progress)
+        every = max(1, round(task.record_hz / IMAGES_HZ)) if with_images else 1
+        rate_hz = task.record_hz / every
+        with DatasetWriter(folder, task=task.name, description=task.description, rate_hz=rate_hz) as writer:
+            record(task, writer, count, with_images=with_images, every=every, on_progress=on_progress)
     return load_demonstrations(folder, task=task.name, limit=count)

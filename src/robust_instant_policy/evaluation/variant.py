@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from robust_instant_policy.policies import ASKING_METHODS, DOF, REGRESSING_METHODS
+from robust_instant_policy.policies import ASKING_METHODS, DOF, REGRESSING_METHODS, TRAINED_METHODS
+from robust_instant_policy.policies.training import DEFAULT_STEPS
 
 
 @dataclass(frozen=True)
@@ -13,9 +14,9 @@ class Variant:
     """A method with every setting that its plans depend on, beside demonstrations and scene.
 
     ``demos`` demonstrations are shown; ``queries`` is the paper's Q, ``dof`` its ν; ``downsampling``, ``frames``,
-    ``layout`` and ``features`` are those of `InstantPolicy`; ``model`` names the language model. What a method does
-    not use is always empty (``dof`` None), so that the same work is never done, nor counted, under two names; RIP
-    with ν = ∞ is "rip-gauss".
+    ``layout`` and ``features`` are those of `InstantPolicy`; ``model`` names the language model; ``steps`` is how long
+    a method is trained. What a method does not use is always empty (``dof`` and ``steps`` None), so that the same work
+    is never done, nor counted, under two names; RIP with ν = ∞ is "rip-gauss".
     """
 
     method: str
@@ -27,9 +28,12 @@ class Variant:
     layout: str = "factorised"
     features: str = "auto"
     model: str = ""
+    steps: int | None = DEFAULT_STEPS
 
     def __post_init__(self) -> None:
         changed: dict[str, str | float | None] = {}
+        if self.method not in TRAINED_METHODS:
+            changed["steps"] = None
         if self.method == "rip" and self.dof is not None and math.isinf(self.dof):
             changed["method"] = "rip-gauss"
         if self.method == "rip-gauss":
@@ -52,6 +56,7 @@ class Variant:
             self.downsampling,
             self.frames,
             self.layout,
+            "" if self.steps is None else f"{self.steps}steps",
         )
         return "-".join(word for word in words if word)
 

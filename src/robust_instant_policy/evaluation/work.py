@@ -12,6 +12,7 @@ from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey
 from robust_instant_policy.evaluation.failures import Failure
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.policies import Plan
+from robust_instant_policy.policies.training import DEFAULT_CHECKPOINTS
 
 MAX_DEATHS = 3  # workers that one scene may take with it before the run gives up
 
@@ -21,7 +22,8 @@ class Setup:
     """What every worker needs to know: the language model, where samples and demonstrations are, and what to keep.
 
     ``llm`` is a line for `llm.connect`; with ``replay`` only stored answers are used. ``deadline_s`` bounds the
-    sampling for one plan. With ``films`` every failed episode is filmed.
+    sampling for one plan. With ``films`` every failed episode is filmed. ``checkpoints`` is where methods that are
+    trained keep their weights.
     """
 
     llm: str
@@ -30,6 +32,7 @@ class Setup:
     data: Path
     deadline_s: float
     films: bool
+    checkpoints: Path = DEFAULT_CHECKPOINTS
 
 
 @dataclass(frozen=True)
@@ -65,10 +68,14 @@ class SceneWork:
     plans: tuple[Variant, ...] = ()
 
     @property
+    def concerned(self) -> tuple[Variant, ...]:
+        """Every variant that any of it is about."""
+        return (*self.variants, *(episode.variant for episode in self.failed), *self.plans)
+
+    @property
     def demos(self) -> int:
         """The most demonstrations that any of it needs."""
-        failed = (episode.variant for episode in self.failed)
-        return max(variant.demos for variant in (*self.variants, *failed, *self.plans))
+        return max(variant.demos for variant in self.concerned)
 
     def without(self, outcomes: Collection[Outcome]) -> SceneWork:
         """What is left of the work once ``outcomes`` are there."""

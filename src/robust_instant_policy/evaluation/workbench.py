@@ -13,10 +13,19 @@ from robust_instant_policy.errors import KeypointError, ModelError, PlanningErro
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import Inquest, Truth, film, true_keypoints
 from robust_instant_policy.evaluation.rollout import roll_out
+from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.evaluation.work import Analysis, Outcome, Planned, SceneWork, Setup
 from robust_instant_policy.llm import LanguageModel, RecordedModel, ReplayedModel, SampleStore, connect, model_name
-from robust_instant_policy.policies import ClosedLoopPolicy, InstantPolicy, Policy, make_policy
+from robust_instant_policy.policies import (
+    IMAGE_METHODS,
+    ClosedLoopPolicy,
+    InstantPolicy,
+    Policy,
+    Training,
+    make_policy,
+)
+from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Task
@@ -33,10 +42,15 @@ class Workbench:
     """
 
     def __init__(
-        self, setup: Setup, store: SampleStore | None = None, demonstrations: DemonstrationSource | None = None
+        self,
+        setup: Setup,
+        store: SampleStore | None = None,
+        demonstrations: DemonstrationSource | None = None,
+        report: TrainingReport = no_report,
     ):
         self._setup = setup
         self._given_store = store
+        self._report = report
         self._demonstrations = demonstrations or self._read_demonstrations
         self._task: Task | None = None
         self._place = ("", "")  # the task and the set of objects that the simulator holds
@@ -61,6 +75,11 @@ class Workbench:
                 with suppress(KeypointError, PlanningError):
                     yield Planned(work.scene, variant, policy.plan(observation))
         yield from self._take_apart(task, work.scene, failed, shown, observation)
+
+    def fit(self, work: SceneWork, variant: Variant) -> None:
+        """Make and fit the policy of ``variant`` for the scenes of ``work``, as `run` would."""
+        self._enter(work.scene)
+        self._policy(variant, self._show(work))
 
     def close(self) -> None:
         if self._task is not None:
@@ -100,8 +119,9 @@ class Workbench:
             self._shown = self._demonstrations(work.scene.task, work.demos)
         return self._shown
 
-    def _read_demonstrations(self, task: str, count: int) -> list[Demonstration]:
-        return load_demonstrations(self._setup.data / task, task=task, limit=count)
+    def _read_demonstrations(self, task: str, count: int, with_images: bool = False) -> list[Demonstration]:
+        folder = demonstrations_folder(self._setup.data, task, with_images)
+        return load_demonstrations(folder, task=task, limit=count)
 
     def _instant(self, variant: Variant) -> InstantPolicy:
         """Shared by all methods that start from the same keypoints and the same prompt."""
@@ -122,9 +142,14 @@ class Workbench:
 
     def _policy(self, variant: Variant, shown: Sequence[Demonstration]) -> AnyPolicy:
         if variant not in self._policies:
-            options = {} if variant.dof is None else {"dof": variant.dof}
+            options: dict[str, Any] = {} if variant.dof is None else {"dof": variant.dof}
+            if variant.steps is not None:
+                options["training"] = Training(self._setup.checkpoints, variant.steps, report=self._report)
             policy = make_policy(variant.method, self._instant(variant), variant.queries, **options)
-            self._policies[variant] = policy.fit(shown[: variant.demos])
+            demonstrations = shown[: variant.demos]
+            if variant.method in IMAGE_METHODS:
+                demonstrations = self._read_demonstrations(self._place[0], variant.demos, with_images=True)
+            self._policies[variant] = policy.fit(demonstrations)
         return self._policies[variant]
 
     def _take_apart(

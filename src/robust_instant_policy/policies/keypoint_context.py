@@ -40,6 +40,14 @@ class KeypointContext:
         self._shown: tuple[Demonstration, ...] = ()
         self._seen: tuple[Observation, Located, Stage] | None = None
 
+    @property
+    def settings(self) -> str:
+        """In words, what decides beside the demonstrations."""
+        return (
+            f"{self.extractor.num_keypoints} keypoints by {self.extractor.features}, "
+            f"{self.downsampling} downsampling to {self.num_steps} steps"
+        )
+
     def fit(self, demonstrations: Sequence[Demonstration]) -> KeypointContext:
         """Find the common keypoints of ``demonstrations``; returns itself.
 

@@ -1,0 +1,126 @@
+"""KAT-DP: the keypoints of KAT in, its trajectory out, with a diffusion model in place of the language model.
+
+The method of the paper's comparison (Di Palo and Johns 2024; Oh et al. 2025, Sec. V-B).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from robust_instant_policy.context.alignment import align
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import UsageError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.policies.diffusion.denoiser import Denoiser
+from robust_instant_policy.policies.diffusion.grippers import Grippers
+from robust_instant_policy.policies.diffusion.scaling import Scaling
+from robust_instant_policy.policies.diffusion.training import Trained, TrainingSettings, known_by, obtain
+from robust_instant_policy.policies.instant import Proposal
+from robust_instant_policy.policies.kat import plan_of_first_candidate
+from robust_instant_policy.policies.keypoint_context import KeypointContext
+from robust_instant_policy.policies.policy import Plan, Stopwatch, Usage
+from robust_instant_policy.policies.training import Training
+from robust_instant_policy.trajectory import Trajectory
+
+METHOD = "kat-dp"
+BATCH_SIZE = 32
+NOISE_DRAWS = 1
+LEARNING_RATE = 3e-4
+KEYPOINT_NOISE_M = 0.003  # keypoints of a new scene are about this uncertain; training sees that
+LENGTH_MULTIPLE = 4  # of the sequences that the network takes
+
+
+class KeypointDiffusion:
+    """Whole trajectories, thinned out as for KAT, sampled by diffusion given the scene's keypoints; open loop.
+
+    ``num_queries`` samples are drawn and the first one is executed, as KAT takes its model at its word.
+    """
+
+    name = METHOD
+    trained_: Trained
+
+    def __init__(self, context: KeypointContext, num_queries: int = 5, training: Training | None = None):
+        self.context, self.num_queries = context, num_queries
+        self.training = training or Training()
+
+    def fit(self, demonstrations: Sequence[Demonstration]) -> Self:
+        """Load the weights that belong to ``demonstrations``, or train them; returns itself."""
+        self.context.fit(demonstrations)
+        aligned = align(self.context.trajectories_)
+        keypoints = self.context.keypoints_[list(aligned.kept)].reshape(len(aligned.kept), -1)
+        actions = aligned.actions
+        self._num_steps = actions.shape[1]
+        self._inputs, self._outputs, self._grippers = Scaling.of(keypoints), Scaling.of(actions), Grippers.of(actions)
+        data = _KeypointData(
+            torch.tensor(self._inputs.scaled(keypoints), dtype=torch.float32),
+            torch.tensor(KEYPOINT_NOISE_M / self._inputs.half_range, dtype=torch.float32),
+            torch.tensor(_padded(self._outputs.scaled(actions)), dtype=torch.float32),
+        )
+        settings = TrainingSettings(
+            METHOD,
+            self.training.steps,
+            BATCH_SIZE,
+            NOISE_DRAWS,
+            LEARNING_RATE,
+            self.training.seed,
+            details=self.context.settings,
+        )
+        self.trained_ = obtain(
+            lambda: Denoiser(nn.Identity(), keypoints.shape[1], actions.shape[2]),
+            lambda: data,
+            settings,
+            # Not by the keypoints: their last bits depend on the number of threads that found them.
+            known_by(demonstrations),
+            f"{METHOD}-{demonstrations[0].task}-{len(demonstrations)}",
+            self.training,
+        )
+        return self
+
+    def plan(self, observation: Observation) -> Plan:
+        """Raises `KeypointError` where the scene cannot be recognised."""
+        if not hasattr(self, "trained_"):
+            raise UsageError("call fit(demonstrations) before asking for a plan")
+        located, locating = self.context.locate(observation)
+        watch = Stopwatch()
+        with watch.stage("diffusion"):
+            candidates = self._sampled(located.keypoints, self.trained_.model)
+        notes = (*self.context.extractor.notes_, *located.notes)
+        return plan_of_first_candidate(Proposal(located, candidates, Usage((locating, *watch.stages)), notes))
+
+    def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
+        """The first sample."""
+        return (plan.trajectory,)
+
+    def _sampled(self, keypoints: FloatArray, model: Denoiser) -> tuple[Trajectory, ...]:
+        device = next(model.parameters()).device
+        condition = torch.tensor(self._inputs.scaled(keypoints.ravel()), dtype=torch.float32, device=device)
+        generator = torch.Generator().manual_seed(self.training.seed)
+        length = -(-self._num_steps // LENGTH_MULTIPLE) * LENGTH_MULTIPLE
+        samples = model.sample(condition.expand(self.num_queries, -1), length, generator)
+        actions = self._outputs.restored(samples.cpu().numpy().astype(np.float64))
+        return tuple(Trajectory.from_actions(self._grippers.nearest(own[: self._num_steps])) for own in actions)
+
+
+class _KeypointData:
+    """Scaled ``keypoints (I, 3·K)``, with noise of size ``noise (3·K,)``, and ``actions (I, T, D)``."""
+
+    def __init__(self, keypoints: Tensor, noise: Tensor, actions: Tensor):
+        self._keypoints, self._noise, self._actions = keypoints, noise, actions
+
+    def __len__(self) -> int:
+        return len(self._keypoints)
+
+    def draw(self, indices: Tensor, generator: torch.Generator) -> tuple[tuple[Tensor, ...], Tensor]:
+        keypoints = self._keypoints[indices]
+        noise = self._noise * torch.randn(keypoints.shape, generator=generator)
+        return (keypoints + noise,), self._actions[indices]
+
+
+def _padded(actions: FloatArray) -> FloatArray:
+    """``actions (I, T, D)`` with the last step repeated up to a length that the network takes."""
+    return np.pad(actions, ((0, 0), (0, -actions.shape[1] % LENGTH_MULTIPLE), (0, 0)), mode="edge")

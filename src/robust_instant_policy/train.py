@@ -1,0 +1,43 @@
+"""`rip train`: a trained method on the screen, and a page that shows what it learned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from robust_instant_policy.console import StageConsole, TrainingScreen
+from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.errors import UnknownNameError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.policies import TRAINED_METHODS, KeypointContext, make_trained_policy
+from robust_instant_policy.policies.training import Training
+from robust_instant_policy.tasks import TASK_NAMES, make_task
+
+
+def train(task: str, method: str, demos: Path, limit: int | None, training: Training) -> None:
+    """Train ``method`` on the first ``limit`` demonstrations of ``task`` in the folder ``demos``, or all of them.
+
+    The checkpoint goes to ``training.checkpoints``, and beside it a page with the loss and samples.
+    """
+    if method not in TRAINED_METHODS:
+        raise UnknownNameError("trained method", method, TRAINED_METHODS)
+    screen = StageConsole()
+    demonstrations = load_demonstrations(demos, task=task, limit=limit)
+    policy = make_trained_policy(
+        method, KeypointContext(workspace=_workspace(task)), replace(training, report=TrainingScreen(screen))
+    )
+    with screen.stage(f"{method} on {len(demonstrations)} demonstrations"):
+        policy.fit(demonstrations)
+    trained = policy.trained_
+    screen.say(f"{trained.path}: {len(trained.losses)} steps in {trained.seconds:.0f} s")
+
+
+def _workspace(task: str) -> FloatArray | None:
+    """The task's, so that the same keypoints are found as when it is evaluated; None for a task of one's own."""
+    if task not in TASK_NAMES:
+        return None
+    simulated = make_task(task)
+    try:
+        return simulated.workspace
+    finally:
+        simulated.close()
