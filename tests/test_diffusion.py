@@ -8,7 +8,7 @@ from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError, ModelError, UsageError
-from robust_instant_policy.policies import KeypointContext
+from robust_instant_policy.policies import InstantPolicy, KeypointContext, make_policy
 from robust_instant_policy.policies.diffusion import ImageDiffusion, KeypointDiffusion, dp, training, vision
 from robust_instant_policy.policies.diffusion.denoiser import Denoiser
 from robust_instant_policy.policies.diffusion.scaling import Scaling
@@ -213,16 +213,11 @@ def test_what_cannot_be_learned_from_is_refused(demonstrations, tmp_path, workbe
         ImageDiffusion().controller(Observation.load(workbench / "observation.npz"))
 
 
-def test_the_command_trains_and_evaluation_finds_what_it_trained(workbench, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(workbench)
-    out = str(tmp_path / "weights")
-    command = ["train", "--task", "push-cube", "--method", "kat-dp", "--demos", "data/push-cube", "--out", out]
-    assert main([*command, "--limit", "5", "--steps", "5"]) == 0
+def test_the_command_trains_what_an_evaluation_then_finds(workbench, demonstrations, tmp_path, capsys):
+    command = ["train", "--task", "push-cube", "--demos", str(workbench / "data" / "push-cube"), "--steps", "5"]
+    assert main([*command, "--method", "kat-dp", "--out", str(tmp_path)]) == 0
     assert "5 steps in" in capsys.readouterr().out
-    weights = list((tmp_path / "weights").glob("*.safetensors"))
-    assert len(weights) == 1
-    evaluation = ["eval", "--methods", "kat-dp", "gp", "--demos", "5", "--episodes", "1", "--steps", "5", "--no-videos"]
-    assert main([*evaluation, "--checkpoints", out, "--workers", "1", "--out", str(tmp_path / "run")]) == 0
-    assert list((tmp_path / "weights").glob("*.safetensors")) == weights
-    assert "gp" in capsys.readouterr().out
-    assert main([*command[:4], "rip", *command[5:]]) == 2
+    instant = InstantPolicy(llm=None)  # nobody asks it anything
+    make_policy("kat-dp", instant, training=Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
+    assert main([*command, "--method", "rip", "--out", str(tmp_path)]) == 2
+    assert "known: dp, kat-dp" in capsys.readouterr().err
