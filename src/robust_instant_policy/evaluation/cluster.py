@@ -1,7 +1,7 @@
 """Workers on a Ray cluster: any number of machines, of which any may go away while they work.
 
 Nothing needs a shared disk. Demonstrations travel to the workers once; samples are read and written through one actor
-beside the rows, on the machine where the command runs; outcomes come back when their scene is done.
+beside the rows, on the machine where the command runs; outcomes come back one by one.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Cluster:
     count: int | None = None
 
     def __call__(self, setup: Setup, works: list[SceneWork]) -> Iterator[Outcome]:
-        """Do ``works``. A scene whose worker is lost, with its machine or alone, is done again elsewhere.
+        """Do ``works``. What a lost worker, alone or with its machine, had not finished is done elsewhere.
 
         Raises `MissingExtraError` without Ray, `UsageError` where there is no cluster at the address, and `RipError`
         with the words of an error that a worker met.
@@ -60,34 +60,43 @@ class Cluster:
                         at_work[member.give(work)] = member
                 ready, _ = ray.wait(list(at_work), timeout=LOOK_SECONDS) if at_work else ([], [])
                 for reference in ready:
-                    member = at_work.pop(reference)
+                    member = at_work[reference]
                     try:
-                        outcomes, words = ray.get(reference)
+                        kind, content = ray.get(next(reference))
+                    except StopIteration:
+                        del at_work[reference]
                     except RayActorError as error:
-                        assert member.work is not None
-                        agenda.put_back(member.work, str(error).splitlines()[0])
+                        del at_work[reference]
+                        agenda.put_back(member.left(), str(error).splitlines()[0])
                         team.bury(member)
-                        continue
                     except RayTaskError as error:
                         raise RipError(f"a worker failed: {error.cause}") from error
-                    yield from outcomes
-                    if words:
-                        raise RipError(words)
+                    else:
+                        if kind == "error":
+                            raise RipError(content)
+                        member.outcomes.append(content)
+                        yield content
         finally:
             ray.shutdown()
 
 
 @dataclass(eq=False)
 class _Member:
-    """A worker actor, and the scene it was given."""
+    """A worker actor, the scene it was given and what it has said of it."""
 
     actor: Any
     task: str = ""
     work: SceneWork | None = None
+    outcomes: list[Outcome] = field(default_factory=list)
 
     def give(self, work: SceneWork) -> Any:
-        self.work, self.task = work, work.scene.task
-        return self.actor.run.remote(work)
+        """Has the actor begin; returns the stream of what comes of it."""
+        self.work, self.task, self.outcomes = work, work.scene.task, []
+        return self.actor.run.options(num_returns="streaming").remote(work)
+
+    def left(self) -> SceneWork:
+        assert self.work is not None
+        return self.work.without(self.outcomes)
 
 
 @dataclass
@@ -133,14 +142,13 @@ class _Actor:
         self._shown = shown
         self._bench = Workbench(setup, cast(SampleStore, _DistantStore(keeper, setup.store)), self._demonstrations)
 
-    def run(self, work: SceneWork) -> tuple[list[Outcome], str]:
-        """What came of ``work``, and the words of the error that ended it early, if one did."""
-        outcomes: list[Outcome] = []
+    def run(self, work: SceneWork) -> Iterator[tuple[str, Any]]:
+        """Each outcome of ``work`` as it comes, and the words of the error that ended it early, if one did."""
         try:
-            outcomes.extend(self._bench.run(work))
+            for outcome in self._bench.run(work):
+                yield "outcome", outcome
         except RipError as error:
-            return outcomes, str(error)
-        return outcomes, ""
+            yield "error", str(error)
 
     def _demonstrations(self, task: str, count: int) -> list[Demonstration]:
         import ray
