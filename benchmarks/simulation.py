@@ -2,16 +2,18 @@
 
     python benchmarks/simulation.py [--attempts 100] [--tasks push-cube …] [--out results/simulation.md]
 
-Replays run the recording, thinned out to about 30 steps, in the scene it was recorded in.
+Replays run the recording, thinned out to about 30 steps, in the scene it was recorded in. What has been measured is
+kept beside ``--out`` as .json: run again it goes on where it stopped.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import platform
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.task import Task
 from robust_instant_policy.trajectory import Trajectory, downsample
 
-UNSEEN = ("close-cabinet", "turn-faucet")
+UNSEEN = ("close-cabinet", "turn-faucet", "aloha-sweep", "aloha-pick-place")
 TIMED_EPISODES = 5
 
 
@@ -103,7 +105,7 @@ def page(qualities: list[Quality], speeds: list[Speed]) -> str:
         lines.append(f"| {one.task} | {one.objects} | {succeeds} | {one.seconds:.1f} s | {masked} | {uniform} |")
     lines += [
         "",
-        "| task | reset with image | simulated s per s | with video | recorded episodes/h | with images at 55 Hz |",
+        "| task | reset with image | simulated s per s | with video | recorded episodes/h | with images |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for each in speeds:
@@ -125,19 +127,25 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", choices=TASK_NAMES, default=TASK_NAMES)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    qualities, speeds = [], []
-    for name in options.tasks:
-        for objects in ("seen", "unseen") if name in UNSEEN else ("seen",):
-            task = make_task(name, objects)
-            if objects == "seen":
-                speeds.append(measure_speed(task))
-            qualities.append(measure_quality(task, objects, options.attempts))
-            task.close()
-            print(qualities[-1], flush=True)
-    text = page(qualities, speeds)
+    kept = None if options.out is None else options.out.with_suffix(".json")
+    measured = json.loads(kept.read_text()) if kept is not None and kept.exists() else {}
+    wanted = [(n, o) for n in options.tasks for o in (("seen", "unseen") if n in UNSEEN else ("seen",))]
+    for name, objects in wanted:
+        key = f"{name} {objects} {options.attempts}"
+        if key in measured:
+            continue
+        task = make_task(name, objects)
+        speed = asdict(measure_speed(task)) if objects == "seen" else None
+        measured[key] = {"quality": asdict(measure_quality(task, objects, options.attempts)), "speed": speed}
+        task.close()
+        print(key, measured[key], flush=True)
+        if kept is not None:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            kept.write_text(json.dumps(measured, indent=1) + "\n")
+    rows = [measured[f"{name} {objects} {options.attempts}"] for name, objects in wanted]
+    text = page([Quality(**row["quality"]) for row in rows], [Speed(**row["speed"]) for row in rows if row["speed"]])
     print(text)
     if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(text)
 
 

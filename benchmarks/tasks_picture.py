@@ -1,16 +1,18 @@
-"""Draws the picture of the tasks in docs/tasks.md: what the camera sees, and the demonstrator at work.
+"""Draws the pictures of the tasks in docs/: what the camera sees, and the demonstrator at work.
 
-python benchmarks/tasks_picture.py docs/images/tasks.jpg
+python benchmarks/tasks_picture.py maniskill docs/images/tasks.jpg
+python benchmarks/tasks_picture.py aloha docs/images/aloha.jpg
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image
 
-from robust_instant_policy.tasks import TASK_NAMES, make_task
+from robust_instant_policy.tasks import FAMILIES, make_task
 from robust_instant_policy.trajectory import downsample
 
 SEED = 4
@@ -18,24 +20,26 @@ SIDE = 240
 AT_SHARE = 0.72  # of the execution, when the still is taken
 
 
-def columns() -> list[np.ndarray]:
+def columns(names: Sequence[str]) -> list[np.ndarray]:
     pictures = []
-    for name in TASK_NAMES:
+    for name in names:
         task = make_task(name)
         demonstration = task.demonstrate(SEED).demonstration
         frames: list[np.ndarray] = []
         task.reset(SEED)
         task.execute(downsample(demonstration.trajectory), frames.append)
         task.close()
-        still = Image.fromarray(frames[int(AT_SHARE * len(frames))])
-        left = (still.width - still.height) // 2
-        views = [
-            Image.fromarray(demonstration.observation.rgb),
-            still.crop((left, 0, left + still.height, still.height)),
-        ]
-        pictures.append(np.concatenate([np.asarray(view.resize((SIDE, SIDE))) for view in views]))
+        views = [demonstration.observation.rgb, frames[int(AT_SHARE * len(frames))]]
+        pictures.append(np.concatenate([square(Image.fromarray(view)) for view in views]))
     return pictures
 
 
+def square(picture: Image.Image) -> np.ndarray:
+    """The middle of ``picture``, `SIDE` pixels wide and high."""
+    left = (picture.width - picture.height) // 2
+    return np.asarray(picture.crop((left, 0, left + picture.height, picture.height)).resize((SIDE, SIDE)))
+
+
 if __name__ == "__main__":
-    Image.fromarray(np.concatenate(columns(), axis=1)).save(sys.argv[1], quality=85)
+    names = next(family.names for family in FAMILIES if family.package == sys.argv[1])
+    Image.fromarray(np.concatenate(columns(names), axis=1)).save(sys.argv[2], quality=85)

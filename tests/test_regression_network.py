@@ -80,3 +80,12 @@ def test_without_torch_the_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MissingExtraError, match=r"robust-instant-policy\[train\]"):
         StudentTNetwork().fit([np.zeros((4, 2))] * 3)
+
+
+def test_the_estimators_names_say_which_recipe_trains_the_network(monkeypatch, scene):
+    trained = []
+    monkeypatch.setattr(StudentTNetwork, "_train_fast", lambda *_: trained.append("fast") or 0)
+    monkeypatch.setattr(StudentTNetwork, "_train_adam", lambda self, x, y, recipe, g: trained.append(recipe.steps) or 0)
+    for estimator in ("network", "network-sim", "network-real"):
+        robust_gripper_trajectory(scene.candidates, estimator=estimator)
+    assert trained == ["fast", 40_000, 100_000]

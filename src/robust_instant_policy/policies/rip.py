@@ -22,10 +22,10 @@ ENOUGH_CONFIDENCE = 0.8  # with adaptive queries: above it, no more are asked
 class RobustInstantPolicy(KeypointActionTokens):
     """Samples ``num_queries`` trajectories and follows their Student's t-regression.
 
-    ``dof`` is the paper's ν; infinity is its Gaussian ablation. ``estimator`` is "em" (the default),
-    "network" (the paper's), "mixture" or "median". With ``adaptive`` the policy starts from three queries and
-    asks for more only while the regression is unsure, ``num_queries`` at most. Further ``options`` are those of
-    `InstantPolicy`.
+    ``dof`` is the paper's ν; infinity is its Gaussian ablation. ``estimator`` is "em" (the default), "network" (the
+    paper's; "network-sim" and "network-real" with its own training), "mixture" or "median". With ``adaptive`` the
+    policy starts from three queries and asks for more only while the regression is unsure, ``num_queries`` at most.
+    Further ``options`` are those of `InstantPolicy`.
     """
 
     def __init__(

@@ -22,7 +22,8 @@ POINT_DIM = 9
 SWITCH_COST = 0.55  # votes, of all at one step, that a change of state must win: a blip of one step never does
 STATE_SCALE = 1 / 7  # a gripper state wrong for four steps is a hallucination, for fewer it is a matter of timing
 TOLERANCE_M = 0.015  # a gripper this far off still grasps
-ESTIMATORS = ("em", "network", "mixture", "median")
+NETWORKS = {"network": "fast", "network-sim": "sim", "network-real": "real"}  # and the recipe that each is trained by
+ESTIMATORS = ("em", *NETWORKS, "mixture", "median")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +60,12 @@ def robust_gripper_trajectory(
 ) -> RobustTrajectory:
     """The robust gripper trajectory of ``candidates``, each ``(T_q, 10·A)``: palm, two fingertips (m), state, per arm.
 
-    ``estimator`` is "em", "network" (the paper's), "mixture" (one whole way of several) or "median" (of each number at
-    each step, as a reference); ``dof`` = inf is the Gaussian ablation, the mean of the candidates. ``times`` are the
-    candidates' own, within [0, 1], evenly spread by default; the result has ``num_steps`` steps, by default the median
-    of the candidates'. ``triangle`` is the gripper, by default measured from the candidates. ``seed`` is the
-    network's. ``tolerance``, metres, is what `RobustTrajectory.confidence` is about.
+    ``estimator`` is "em", "network" (the paper's; "network-sim" and "network-real" train it exactly by the columns of
+    its parameter table), "mixture" (one whole way of several) or "median" (of each number at each step, as a
+    reference); ``dof`` = inf is the Gaussian ablation, the mean of the candidates. ``times`` are the candidates' own,
+    within [0, 1], evenly spread by default; the result has ``num_steps`` steps, by default the median of the
+    candidates'. ``triangle`` is the gripper, by default measured from the candidates. ``seed`` is the network's.
+    ``tolerance``, metres, is what `RobustTrajectory.confidence` is about.
     """
     if estimator not in ESTIMATORS:
         raise UnknownNameError("estimator", estimator, ESTIMATORS)
@@ -124,8 +126,8 @@ def _fit_points(
         by_mode = [np.concatenate(scaled_residuals(mode, points)) for mode in mixture.modes]
         return mixture, np.stack(by_mode)[own, np.arange(len(own))]
     fit: StudentTRegression | StudentTNetwork
-    if estimator == "network":
-        fit = StudentTNetwork(dof, seed=seed).fit(rows, clocks)
+    if estimator in NETWORKS:
+        fit = StudentTNetwork(dof, NETWORKS[estimator], seed).fit(rows, clocks)
     else:
         fit = StudentTRegression(dof, groups=alike).fit(rows, clocks)
     return fit, np.concatenate(scaled_residuals(fit, points))
