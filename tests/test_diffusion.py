@@ -171,6 +171,8 @@ def test_diffusion_policy_learns_recorded_images_and_a_kill_does_not_matter(
     resumed = ImageDiffusion(Training(tmp_path / "cut", steps=40)).fit(demonstrations)
     one, other = load_file(policy.trained_.path), load_file(resumed.trained_.path)
     assert all(torch.equal(one[name], other[name]) for name in one)
+    rehearsal = policy.rehearse(1)[0]
+    assert rehearsal.samples.shape == (1, *rehearsal.shown.shape)
     _drives_the_simulator(policy)
 
 
@@ -201,7 +203,7 @@ def test_a_policy_that_wants_to_stay_where_it_is_is_done(filmed, small_images, t
     policy = ImageDiffusion(Training(tmp_path, steps=1)).fit(load_demonstrations(filmed))
     controller = policy.controller(None)
     here = np.append(np.linspace(0.1, 0.2, 9), 0.0)
-    monkeypatch.setattr(controller, "_planned", lambda: np.tile(here, (dp.EXECUTED, 1)))
+    monkeypatch.setattr(controller, "planned", lambda seen: np.tile(here, (dp.EXECUTED, 1)))
     image = np.zeros((64, 64, 3), np.uint8)
     assert [controller.act(image, here) is None for _ in range(5)] == [False] * 4 + [True]
 
@@ -217,6 +219,7 @@ def test_the_command_trains_what_an_evaluation_then_finds(workbench, demonstrati
     command = ["train", "--task", "push-cube", "--demos", str(workbench / "data" / "push-cube"), "--steps", "5"]
     assert main([*command, "--method", "kat-dp", "--out", str(tmp_path)]) == 0
     assert "5 steps in" in capsys.readouterr().out
+    assert "demonstration 2" in next(tmp_path.glob("*.svg")).read_text()
     instant = InstantPolicy(llm=None)  # nobody asks it anything
     make_policy("kat-dp", instant, training=Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
     assert main([*command, "--method", "rip", "--out", str(tmp_path)]) == 2

@@ -22,7 +22,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.diffusion.denoiser import Denoiser
 from robust_instant_policy.policies.diffusion.grippers import Grippers
 from robust_instant_policy.policies.diffusion.scaling import Scaling
-from robust_instant_policy.policies.diffusion.training import Trained, TrainingSettings, known_by, obtain
+from robust_instant_policy.policies.diffusion.training import Rehearsal, Trained, TrainingSettings, known_by, obtain
 from robust_instant_policy.policies.diffusion.vision import ImageEncoder
 from robust_instant_policy.policies.training import Training
 
@@ -61,6 +61,7 @@ class ImageDiffusion:
         every = max(1, round(demonstrations[0].rate_hz / DECISIONS_HZ))
         self.rate_hz = demonstrations[0].rate_hz / every
         self.max_seconds = PATIENCE * max(demonstration.seconds for demonstration in demonstrations)
+        self._shown, self._every = demonstrations, every
         actions = [shown.trajectory.actions[_kept(len(shown.trajectory), every)] for shown in demonstrations]
         self._scaling, self._grippers = Scaling.of(np.concatenate(actions)), Grippers.of(np.concatenate(actions))
         settings = TrainingSettings(
@@ -89,6 +90,20 @@ class ImageDiffusion:
             raise UsageError("call fit(demonstrations) before asking for a controller")
         return DiffusionController(self.trained_.model, self._scaling, self._grippers, self.rate_hz, self.training.seed)
 
+    def rehearse(self, count: int) -> list[Rehearsal]:
+        """What it would do next, all along the first ``count`` demonstrations, looking wherever it would look."""
+        rehearsals = []
+        for demonstration in self._shown[:count]:
+            actions = demonstration.trajectory.actions[_kept(len(demonstration.trajectory), self._every)]
+            controller = self.controller(demonstration.observation)
+            images = _images(demonstration, self._every)
+            seen = [controller.look(image, now) for image, now in zip(images, actions, strict=True)]
+            plans = [
+                controller.planned(seen[max(0, step - 1) : step + 1]) for step in range(0, len(seen) - 1, EXECUTED)
+            ]
+            rehearsals.append(Rehearsal(actions[1:], np.concatenate(plans)[None, : len(actions) - 1]))
+        return rehearsals
+
 
 class DiffusionController:
     """Plans `HORIZON` actions, commands `EXECUTED` of them, looks again. See `controller.Controller`."""
@@ -102,18 +117,17 @@ class DiffusionController:
         self._pending: FloatArray | None = None
         self._still = 0
 
-    @torch.no_grad()
     def act(self, image: NDArray[np.uint8], action: FloatArray) -> FloatArray | None:
         # Recordings hold where the hand was told to be, so that is what the model is shown; it lags a little behind.
         state = action if self._commanded is None else self._commanded
-        self._seen = [*self._seen[1 - HISTORY :], self._look(image, state)]
+        self._seen = [*self._seen[1 - HISTORY :], self.look(small(image), state)]
         if self._pending is not None:
             waypoints, self._pending = self._pending, None
             self._commanded = waypoints[-1]
             return waypoints
         if self._still == STILL_PLANS:
             return None
-        waypoints = self._planned()
+        waypoints = self.planned(self._seen)
         led_to = np.abs(waypoints - state).max()
         self._still = self._still + 1 if led_to < STILL_M else 0
         # The last one waits for another look: the model knows the scene by the images before and after it.
@@ -121,19 +135,21 @@ class DiffusionController:
         self._commanded = waypoints[-1]
         return waypoints
 
-    def _planned(self) -> FloatArray:
-        """The next waypoints ``(EXECUTED, 10·A)``."""
-        condition = torch.cat([self._seen[0]] * (HISTORY - len(self._seen)) + self._seen, dim=-1)
+    @torch.no_grad()
+    def planned(self, seen: Sequence[Tensor]) -> FloatArray:
+        """The next waypoints ``(EXECUTED, 10·A)`` after what was ``seen``, at most `HISTORY` looks, the newest last."""
+        condition = torch.cat([seen[0]] * (HISTORY - len(seen)) + list(seen), dim=-1)
         sample = self._model.sample(condition, HORIZON, self._generator)[0, :EXECUTED]
         return self._grippers.nearest(self._scaling.restored(sample.cpu().numpy().astype(np.float64)))
 
-    def _look(self, image: NDArray[np.uint8], action: FloatArray) -> Tensor:
-        """What the model makes of one image and the gripper in it ``(1, C)``."""
+    @torch.no_grad()
+    def look(self, image: Tensor, action: FloatArray) -> Tensor:
+        """What the model makes of one image, as `small` returns it, and of the gripper in it ``(1, C)``."""
         device = next(self._model.parameters()).device
         margin = (IMAGE_PIXELS - CROP_PIXELS) // 2
         offsets = torch.full((1, 1, 2), margin)
         state = torch.tensor(self._scaling.scaled(action), dtype=torch.float32)[None, None]
-        return self._model.encoder(small(image)[None, None].to(device), offsets.to(device), state.to(device))
+        return self._model.encoder(image[None, None].to(device), offsets.to(device), state.to(device))
 
 
 class _Encoder(nn.Module):

@@ -19,7 +19,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.diffusion.denoiser import Denoiser
 from robust_instant_policy.policies.diffusion.grippers import Grippers
 from robust_instant_policy.policies.diffusion.scaling import Scaling
-from robust_instant_policy.policies.diffusion.training import Trained, TrainingSettings, known_by, obtain
+from robust_instant_policy.policies.diffusion.training import Rehearsal, Trained, TrainingSettings, known_by, obtain
 from robust_instant_policy.policies.instant import Proposal
 from robust_instant_policy.policies.kat import plan_of_first_candidate
 from robust_instant_policy.policies.keypoint_context import KeypointContext
@@ -54,7 +54,7 @@ class KeypointDiffusion:
         aligned = align(self.context.trajectories_)
         keypoints = self.context.keypoints_[list(aligned.kept)].reshape(len(aligned.kept), -1)
         actions = aligned.actions
-        self._num_steps = actions.shape[1]
+        self._keypoints, self._actions = keypoints, actions
         self._inputs, self._outputs, self._grippers = Scaling.of(keypoints), Scaling.of(actions), Grippers.of(actions)
         data = _KeypointData(
             torch.tensor(self._inputs.scaled(keypoints), dtype=torch.float32),
@@ -96,14 +96,22 @@ class KeypointDiffusion:
         """The first sample."""
         return (plan.trajectory,)
 
+    def rehearse(self, count: int) -> list[Rehearsal]:
+        """Its samples in the scenes of the first ``count`` demonstrations."""
+        return [
+            Rehearsal(shown, np.stack([sample.actions for sample in self._sampled(keypoints, self.trained_.model)]))
+            for keypoints, shown in zip(self._keypoints[:count], self._actions[:count], strict=True)
+        ]
+
     def _sampled(self, keypoints: FloatArray, model: Denoiser) -> tuple[Trajectory, ...]:
         device = next(model.parameters()).device
         condition = torch.tensor(self._inputs.scaled(keypoints.ravel()), dtype=torch.float32, device=device)
         generator = torch.Generator().manual_seed(self.training.seed)
-        length = -(-self._num_steps // LENGTH_MULTIPLE) * LENGTH_MULTIPLE
+        num_steps = self._actions.shape[1]
+        length = -(-num_steps // LENGTH_MULTIPLE) * LENGTH_MULTIPLE
         samples = model.sample(condition.expand(self.num_queries, -1), length, generator)
         actions = self._outputs.restored(samples.cpu().numpy().astype(np.float64))
-        return tuple(Trajectory.from_actions(self._grippers.nearest(own[: self._num_steps])) for own in actions)
+        return tuple(Trajectory.from_actions(self._grippers.nearest(own[:num_steps])) for own in actions)
 
 
 class _KeypointData:

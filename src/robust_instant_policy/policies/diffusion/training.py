@@ -16,6 +16,7 @@ from torch import Tensor
 
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import ModelError
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.diffusion import checkpoint
 from robust_instant_policy.policies.diffusion.denoiser import Denoiser
 from robust_instant_policy.policies.training import Training
@@ -62,6 +63,14 @@ class Trained:
     model: Denoiser
     losses: np.ndarray
     seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Rehearsal:
+    """What a policy samples where it was shown what to do: ``samples (Q, T, D)`` beside ``shown (T, D)``."""
+
+    shown: FloatArray
+    samples: FloatArray
 
 
 def obtain(
