@@ -10,13 +10,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from robust_instant_policy.errors import DatasetError, InvalidValueError, UnknownNameError
-from robust_instant_policy.evaluation import Choice, Episode, Scene, Suite, Variant, make_suites, open_episodes, paper
+from robust_instant_policy.errors import DatasetError, InvalidValueError, RipError, UnknownNameError
+from robust_instant_policy.evaluation import (
+    Analysis,
+    Choice,
+    Episode,
+    Failure,
+    Scene,
+    Suite,
+    Variant,
+    make_suites,
+    open_episodes,
+    paper,
+)
 from robust_instant_policy.evaluation.experiment import missing_work, wanted_plans
 from robust_instant_policy.evaluation.manifest import Manifest, session
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test, wilson_interval
 from robust_instant_policy.evaluation.summary import Summary
 from robust_instant_policy.evaluation.tables import tables
+from robust_instant_policy.evaluation.work import MAX_DEATHS, Agenda, SceneWork
 
 RIP = Variant("rip", model="a model")
 KAT = Variant("kat", model="a model")
@@ -204,3 +216,35 @@ def test_a_run_remembers_its_suites_and_the_commands_that_made_it(tmp_path):
     assert manifest.suites == (one.merged(two),)
     assert manifest.suites[0].tasks == ("push-cube", "turn-faucet")
     assert [one.command for one in manifest.sessions] == ["rip eval --out 'a b'"] * 2
+
+
+def test_a_worker_stays_with_its_task_and_others_take_another():
+    scenes = [Scene(task, "seen", seed) for task in ("push-cube", "turn-faucet") for seed in (1, 2)]
+    agenda = Agenda([SceneWork(scene, (RIP,)) for scene in scenes])
+    first = agenda.next("", [])
+    second = agenda.next("", [first.scene.task])
+    third = agenda.next(first.scene.task, [second.scene.task])
+    assert first.scene.task == third.scene.task != second.scene.task
+    assert agenda.next(second.scene.task, []).scene.task == second.scene.task
+    assert agenda.next("push-cube", []) is None
+
+
+def test_a_scene_that_ends_every_worker_ends_the_run_in_one_line():
+    work = SceneWork(Scene("push-cube", "seen", 1), (RIP,))
+    agenda = Agenda([])
+    for _ in range(MAX_DEATHS - 1):
+        agenda.put_back(work, "signal SIGKILL")
+    with pytest.raises(RipError, match=r"push-cube-seen-1 .* SIGKILL"):
+        agenda.put_back(work, "signal SIGKILL")
+
+
+def test_what_a_dead_worker_had_finished_is_not_handed_out_again():
+    scene = Scene("push-cube", "seen", 1)
+    work = SceneWork(scene, (RIP, KAT), plans=(RIP,))
+    won, lost = episode(RIP, 1, True), episode(KAT, 1, False, of=5)
+    left = work.without([won, lost])
+    assert left.done == {won.key, lost.key}
+    assert left.failed == (lost,)
+    assert left.plans == (RIP,)
+    examined = Analysis(Failure(scene, KAT, 0, "samples", True, False, 0.01, False))
+    assert left.without([examined]).failed == ()
