@@ -27,7 +27,7 @@ PAGE_FILE = "index.html"
 
 
 def publish(out: Path) -> str:
-    """Write, for each suite in ``out``, ``SUITE.md``, ``SUITE.svg`` and ``SUITE.png``; then ``failures.md``,
+    """Write, for each suite in ``out``, ``SUITE.svg``, ``SUITE.png`` and ``SUITE.md``; then ``failures.md``,
     ``run.md``, ``table.md`` with all tables, and ``index.html``. Returns the text of ``table.md``.
 
     Raises `DatasetError` where nothing has been executed yet.
@@ -64,7 +64,8 @@ def _publish_suite(out: Path, suite: Suite, summary: Summary) -> Section:
     section = Section(suite.name, suite.objects, drawing, tables(summary))
     write_whole(out / f"{stem}.svg", drawing)
     write_whole(out / f"{stem}.png", encode(figure, "png"))
-    write_whole(out / f"{stem}.md", _text(section.tables).encode())
+    if section.tables:
+        write_whole(out / f"{stem}.md", _text(section.tables).encode())
     return section
 
 

@@ -171,7 +171,11 @@ def session_table(sessions: Sequence[Session], episodes: Sequence[Episode]) -> T
     for one in sessions:
         rows.setdefault((one.command, one.machine, one.code), []).append(one.hours)
     models = sorted({row.variant.model for row in episodes if row.variant.model})
-    planning = sum(row.seconds for row in episodes if row.candidate == 0) / 3600
+    shared: dict[tuple, float] = {}  # methods that share samples all count the time it took to get them
+    for row in episodes:
+        samples = row.scene, row.variant.demos, row.variant.downsampling, row.variant.frames, row.variant.layout
+        shared[samples] = max(shared.get(samples, 0.0), row.seconds)
+    planning = sum(shared.values()) / 3600
     physics = sum(row.physics_seconds for row in episodes) / 3600
     return Table(
         ("command", "machine", "version", "sessions", "hours"),
