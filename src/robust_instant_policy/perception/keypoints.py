@@ -12,6 +12,7 @@ from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception.cloud import foreground
+from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.objects import MovingObject, Registration, View, moving_objects
 from robust_instant_policy.perception.registration import NEAR_M, local_shift
@@ -64,7 +65,7 @@ class KeypointExtractor:
     def __init__(
         self,
         num_keypoints: int = 10,
-        features: str = "auto",
+        features: str | DescriptorNetwork = "auto",
         workspace: ArrayLike | None = None,
         seed: int = 0,
         settings: DescriptorSettings | None = None,

@@ -12,13 +12,16 @@ from robust_instant_policy.perception.settings import DescriptorSettings
 WEIGHTS_VARIABLE = "RIP_DINO_WEIGHTS"  # a folder or safetensors file that holds the weights
 
 
-def choose_network(features: str, settings: DescriptorSettings) -> tuple[DescriptorNetwork, str]:
+def choose_network(features: str | DescriptorNetwork, settings: DescriptorSettings) -> tuple[DescriptorNetwork, str]:
     """The network that ``features`` names, and one line that says which was taken and why.
 
     ``"efficientnet"`` works offline. ``"dino"`` takes the model of the settings, from `WEIGHTS_VARIABLE`, the local
     cache or the hub. ``"auto"`` is DINO where its weights are on this machine, otherwise EfficientNet; it never
-    asks the network. Anything else is a folder, a safetensors file or a name on the hub.
+    asks the network. Any other text is a folder, a safetensors file or a name on the hub; a `DescriptorNetwork` is
+    taken as it is.
     """
+    if not isinstance(features, str):
+        return features, f"features: {features.name}"
     local = os.environ.get(WEIGHTS_VARIABLE, "")
     if features == "efficientnet":
         return _efficientnet(settings), "features: efficientnet-lite0, which ships with a package"
