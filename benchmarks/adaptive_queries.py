@@ -5,8 +5,8 @@
 
 Made-up scenes (`pick_and_place.py`): ten samples each are kept in `runs/adaptive_queries.sqlite` and asked for once.
 Some are then replaced by hallucinations, the same answer read in the scene of a demonstration, another one for each,
-so that a whole candidate goes to wrong places. Adaptive starts from three and adds one as long as the plan's confidence is below the
-threshold, ten at most. A run of `rip eval` must hold the methods `rip` and `rip-adaptive`.
+so that a whole candidate goes to wrong places. Adaptive starts from three and adds one as long as the plan is not
+confident enough, ten at most. A run of `rip eval` must hold the methods `rip` and `rip-adaptive`.
 """
 
 from __future__ import annotations

@@ -11,11 +11,13 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import signal
 import threading
 import time
 import urllib.request
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,7 +31,7 @@ SHORT_TOKENS = 1024  # prompts up to this long, with their answers, are run many
 SLOT_STEP_TOKENS, LONG_STEP_TOKENS = 256, 4096  # slots for short and long prompts come in multiples of these
 SHORT_SLOTS = 32  # over all cores; a plan has about thirty steps
 MAX_SERVERS = 8  # cores beyond this bring little to about thirty prompts
-PROGRESS_TOKENS = 512  # read between two looks at the deadline
+PROGRESS_TOKENS = 128  # read between two looks at the deadline, and at Ctrl-C, by each prompt
 MAX_CONTEXT_TOKENS = 32_768  # bounds memory for models with a longer context
 
 
@@ -180,8 +182,9 @@ class LlamaModel:
             raise MissingExtraError("xllamacpp", "embedded") from None
         self.close()  # frees the other layout's memory first
         try:
-            for _ in range(layout.servers):
-                self._servers.append(xllamacpp.Server(self._params(xllamacpp, layout)))
+            with _signals_held():
+                for _ in range(layout.servers):
+                    self._servers.append(xllamacpp.Server(self._params(xllamacpp, layout)))
         except (RuntimeError, ValueError) as error:
             self.close()
             raise ModelError(f"llama.cpp cannot load {self._path} ({error}); is the file whole?") from None
@@ -252,6 +255,22 @@ def _complete(server: Any, request: dict[str, Any], deadline: _Deadline) -> Answ
         completion_tokens=len(pieces),
         seconds=time.monotonic() - start,
     )
+
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """Ctrl-C waits until the end: a server that is interrupted while it starts never does.
+
+    Its threads inherit this, so that the signal comes to Python's main thread later on, too.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _free_cores() -> int:
