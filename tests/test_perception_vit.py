@@ -208,6 +208,20 @@ def test_a_lone_safetensors_file_is_enough(vit_folder):
     assert file.config.num_positions == 65
 
 
+def test_weights_spread_over_several_files_are_put_together(vit_folder, tmp_path):
+    whole = load_checkpoint(str(vit_folder))
+    model = transformers.ViTModel.from_pretrained(vit_folder)
+    model.save_pretrained(tmp_path, max_shard_size="50KB")
+    shards = sorted(tmp_path.glob("model-*.safetensors"))
+    assert len(shards) > 1
+    split = load_checkpoint(str(tmp_path))
+    assert split.config == whole.config
+    assert all(torch.equal(split.tensors[name], tensor) for name, tensor in whole.tensors.items())
+    shards[0].unlink()
+    with pytest.raises(ModelError, match=f"names {shards[0].name}, which is not there"):
+        load_checkpoint(str(tmp_path))
+
+
 def test_a_checkpoint_that_does_not_fit_says_which_tensors(vit_folder, tmp_path):
     tensors = load_file(vit_folder / "model.safetensors")
     del tensors["encoder.layer.3.output.dense.bias"]

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 HUB_TIMEOUT_S = 3.0
-WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")  # the first that the hub has is taken
+INDEX_FILE = "model.safetensors.index.json"  # of weights that are spread over several files
+WEIGHT_FILES = ("model.safetensors", INDEX_FILE, "pytorch_model.bin")  # the first that is there is taken
 HEAD_DIM = 64  # of every DINO and DINOv2 model; used where a lone safetensors file does not say
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
@@ -148,7 +149,10 @@ def _download(name: str) -> Path:
         hf_hub_download(name, "config.json", etag_timeout=HUB_TIMEOUT_S)
         for file in WEIGHT_FILES:
             try:
-                return Path(hf_hub_download(name, file, etag_timeout=HUB_TIMEOUT_S)).parent
+                found = Path(hf_hub_download(name, file, etag_timeout=HUB_TIMEOUT_S))
+                for shard in _shards(found) if file == INDEX_FILE else ():
+                    hf_hub_download(name, shard, etag_timeout=HUB_TIMEOUT_S)
+                return found.parent
             except LocalEntryNotFoundError:
                 raise
             except EntryNotFoundError:
@@ -174,30 +178,43 @@ def _from_folder(folder: Path) -> VitCheckpoint:
     facts: dict[str, dict[str, Any]] = {}
     for name in ("config", "preprocessor_config"):
         path = folder / f"{name}.json"
-        try:
-            facts[name] = json.loads(path.read_text()) if path.exists() else {}
-        except ValueError as error:
-            raise ModelError(f"{path} is not JSON: {error}") from error
+        facts[name] = _json(path) if path.exists() else {}
     for file in WEIGHT_FILES:
         if (folder / file).exists():
             return _from_file(folder / file, facts["config"], facts["preprocessor_config"])
     raise ModelError(f"{folder} has none of {', '.join(WEIGHT_FILES)}")
 
 
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text())
+    except ValueError as error:
+        raise ModelError(f"{path} is not JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise ModelError(f"{path} holds a list or a single value where names with values belong")
+    return content
+
+
+def _shards(index: Path) -> list[str]:
+    """The files beside ``index`` over which the weights are spread."""
+    files = _json(index).get("weight_map")
+    if not isinstance(files, dict) or not all(isinstance(file, str) for file in files.values()):
+        raise ModelError(f"{index} does not say which file holds which tensor (weight_map)")
+    names = sorted(set(files.values()))
+    if any(Path(name).name != name for name in names):
+        raise ModelError(f"{index} names files outside its folder")
+    return names
+
+
 def _from_file(path: Path, config: Mapping[str, Any], preprocessing: Mapping[str, Any]) -> VitCheckpoint:
-    try:
-        import torch
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-    except ImportError as error:
-        raise MissingExtraError(error.name or "safetensors", "vision") from error
-    try:
-        if path.suffix == ".safetensors":
-            tensors = load_file(path)
-        else:
-            tensors = torch.load(path, map_location="cpu", weights_only=True)
-    except (SafetensorError, OSError, RuntimeError, ValueError, EOFError) as error:
-        raise ModelError(f"{path} cannot be read as weights: {str(error).splitlines()[0]}") from error
+    if path.name == INDEX_FILE:
+        tensors: dict[str, Any] = {}
+        for shard in _shards(path):
+            if not (path.parent / shard).exists():
+                raise ModelError(f"{path} names {shard}, which is not there; copy all of the model's files")
+            tensors |= _tensors(path.parent / shard)
+    else:
+        tensors = _tensors(path)
     # A model saved with its classifier keeps the transformer under a name of its own.
     bare = {name.removeprefix("vit.").removeprefix("dinov2."): tensor.float() for name, tensor in tensors.items()}
     return VitCheckpoint(
@@ -206,6 +223,21 @@ def _from_file(path: Path, config: Mapping[str, Any], preprocessing: Mapping[str
         tuple(preprocessing.get("image_mean", IMAGENET_MEAN)),
         tuple(preprocessing.get("image_std", IMAGENET_DEVIATION)),
     )
+
+
+def _tensors(path: Path) -> dict[str, Any]:
+    try:
+        import torch
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
+    except ImportError as error:
+        raise MissingExtraError(error.name or "safetensors", "vision") from error
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (SafetensorError, OSError, RuntimeError, ValueError, EOFError) as error:
+        raise ModelError(f"{path} cannot be read as weights: {str(error).splitlines()[0]}") from error
 
 
 def _configuration(path: Path, tensors: Mapping[str, Tensor], told: Mapping[str, Any]) -> VitConfig:
