@@ -33,11 +33,12 @@ CLOSED = 0.5  # gripper states above this count as closed
 class Arm:
     """What the executor has to know of an arm with a parallel gripper.
 
-    ``home (J,)`` joint angles in rad; ``finger_travel`` of each finger from closed (0) to open, in metres, and
-    ``finger_speed``, m/s; ``joint_speed`` rad/s and ``tool_speed`` m/s are limits; ``turn_tolerance``, rad, is how far
-    the tool may be turned from what was asked for.
+    ``name`` as the task calls it; ``home (J,)`` joint angles in rad; ``finger_travel`` of each finger from closed (0)
+    to open, in metres, and ``finger_speed``, m/s; ``joint_speed`` rad/s and ``tool_speed`` m/s are limits;
+    ``turn_tolerance``, rad, is how far the tool may be turned from what was asked for.
     """
 
+    name: str
     kinematics: Kinematics
     home: FloatArray
     triangle: GripperTriangle
@@ -119,7 +120,7 @@ def plan_onward(waypoints: ArrayLike, waypoint_hz: float, before: Motion, arm: A
 def _tool_poses(trajectory: Trajectory, arm: Arm) -> FloatArray:
     """Tool poses ``(T, 4, 4)``, known to be those of a gripper above the table."""
     if trajectory.num_arms != 1:
-        raise UnreachableError(f"the trajectory is for {trajectory.num_arms} arms, this cell has one")
+        raise UnreachableError(f"the trajectory is for {trajectory.num_arms} grippers, this task's is one: {arm.name}")
     triplets = trajectory.triplets[:, 0]
     poses = arm.triangle.poses(triplets)
     misfit = np.sqrt(((arm.triangle.triplets(poses) - triplets) ** 2).sum(axis=-1).mean(axis=-1))

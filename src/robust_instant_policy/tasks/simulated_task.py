@@ -79,6 +79,7 @@ class SimulatedTask:
 
     def __init__(self, spec: TaskSpec, cell: Cell, arm: Arm, timing: Timing, workspace: FloatArray):
         self.name, self.description, self.goal = spec.name, spec.description, spec.goal
+        self.end_effectors = (arm.name,)
         self.record_hz = timing.control_hz / timing.record_every
         self.execute_hz = timing.execute_hz
         self.video_hz = timing.control_hz / timing.frame_every

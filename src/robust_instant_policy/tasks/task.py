@@ -47,7 +47,8 @@ class Task(Protocol):
     """A scene, a robot in it, and a person who can show what to do.
 
     ``description`` says what is to be done, in one sentence, and ``goal`` what is true once it is done
-    ("the cube is in the goal"). ``workspace (2, 3)`` are the lower and upper corner, in metres, of the volume in
+    ("the cube is in the goal"). ``end_effectors`` names the grippers that a trajectory of this task is for, in the
+    order of its columns. ``workspace (2, 3)`` are the lower and upper corner, in metres, of the volume in
     which the arm works; keypoints outside it mean nothing. ``record_hz`` and ``execute_hz`` are the rates of
     demonstrations and of the waypoints played back, ``video_hz`` that of the frames `execute` hands out.
     """
@@ -55,6 +56,7 @@ class Task(Protocol):
     name: str
     description: str
     goal: str
+    end_effectors: tuple[str, ...]
     record_hz: float
     execute_hz: float
     video_hz: float

@@ -141,6 +141,7 @@ def working_arm() -> Arm:
         spec.compile(), f"{WORKING}/{TOOL}", "site", len(ARM_JOINTS), np.eye(4), RELUCTANCE_M, ORIENTATION_COST_M
     )
     return Arm(
+        name="left",
         kinematics=kinematics,
         home=np.array(HOME_JOINTS),
         triangle=TRIANGLE,

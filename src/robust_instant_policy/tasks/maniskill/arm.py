@@ -36,6 +36,7 @@ def ur5e_kinematics(base_position: ArrayLike) -> Kinematics:
 def ur5e_hande() -> Arm:
     """The arm of the cell."""
     return Arm(
+        name="hand-e",
         kinematics=ur5e_kinematics(BASE_POSITION_M),
         home=np.array(HOME_JOINTS),
         triangle=PALM_TRIANGLE,
