@@ -113,11 +113,11 @@ def test_two_evaluations_do_not_write_into_one_folder(tmp_path):
 
 def test_an_error_in_a_worker_is_told_in_one_line(workbench, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(workbench)
-    command = ["eval", "--methods", "rip", "--tasks", "push-cube", "--demos", str(SHOWN), "--episodes", "1"]
-    assert main([*command, "--replay", "--out", str(tmp_path)]) == 1
+    command = ["eval", "--methods", "neighbours", "--tasks", "push-cube", "--demos", str(SHOWN), "--episodes", "1"]
+    assert main([*command, "--objects", "unseen", "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert "holds no answers" in error
+    assert "unknown set of objects of push-cube" in error
 
 
 @pytest.fixture(scope="module")

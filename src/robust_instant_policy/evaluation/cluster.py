@@ -13,9 +13,9 @@ from typing import Any, cast
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
-from robust_instant_policy.errors import MissingExtraError, RipError, UsageError
+from robust_instant_policy.errors import MissingExtraError, UsageError
 from robust_instant_policy.evaluation.processes import ONE_THREAD
-from robust_instant_policy.evaluation.work import Agenda, Outcome, SceneWork, Setup
+from robust_instant_policy.evaluation.work import Agenda, Outcome, SceneWork, Setup, Trouble
 from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.llm import SampleStore
 
@@ -38,7 +38,7 @@ class Cluster:
         """
         try:
             import ray
-            from ray.exceptions import RayActorError, RayTaskError
+            from ray.exceptions import RayActorError
         except ModuleNotFoundError as error:
             raise MissingExtraError("ray", "distributed") from error
         try:
@@ -62,20 +62,18 @@ class Cluster:
                 for reference in ready:
                     member = at_work[reference]
                     try:
-                        kind, content = ray.get(next(reference))
+                        said = ray.get(next(reference))
                     except StopIteration:
                         del at_work[reference]
                     except RayActorError as error:
                         del at_work[reference]
                         agenda.put_back(member.left(), str(error).splitlines()[0])
                         team.bury(member)
-                    except RayTaskError as error:
-                        raise RipError(f"a worker failed: {error.cause}") from error
                     else:
-                        if kind == "error":
-                            raise RipError(content)
-                        member.outcomes.append(content)
-                        yield content
+                        if isinstance(said, Trouble):
+                            raise said.as_error()
+                        member.outcomes.append(said)
+                        yield said
         finally:
             ray.shutdown()
 
@@ -142,13 +140,12 @@ class _Actor:
         self._shown = shown
         self._bench = Workbench(setup, cast(SampleStore, _DistantStore(keeper, setup.store)), self._demonstrations)
 
-    def run(self, work: SceneWork) -> Iterator[tuple[str, Any]]:
-        """Each outcome of ``work`` as it comes, and the words of the error that ended it early, if one did."""
+    def run(self, work: SceneWork) -> Iterator[Outcome | Trouble]:
+        """Each outcome of ``work`` as it comes, and the error that ended it early, if one did."""
         try:
-            for outcome in self._bench.run(work):
-                yield "outcome", outcome
-        except RipError as error:
-            yield "error", str(error)
+            yield from self._bench.run(work)
+        except Exception as error:
+            yield Trouble.of(error)
 
     def _demonstrations(self, task: str, count: int) -> list[Demonstration]:
         import ray

@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -13,8 +12,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from robust_instant_policy.errors import RipError
-from robust_instant_policy.evaluation.work import Agenda, Outcome, SceneWork, Setup
+from robust_instant_policy.evaluation.work import Agenda, Outcome, SceneWork, Setup, Trouble
 from robust_instant_policy.evaluation.workbench import Workbench
 
 # Sums depend in their last bits on the number of threads that share them, and prompts on every bit: one thread a
@@ -86,17 +84,14 @@ class _Worker:
 
     def receive(self) -> Outcome | None:
         """The next outcome, or None once the scene is done; `EOFError` when the process is no more."""
-        kind, content = self.pipe.recv()
-        if kind == "done":
+        said = self.pipe.recv()
+        if said is None:
             self.work = None
             return None
-        if kind == "error":
-            words, trace = content
-            error = RipError(words)
-            error.add_note(trace)
-            raise error
-        self.outcomes.append(content)
-        return content
+        if isinstance(said, Trouble):
+            raise said.as_error()
+        self.outcomes.append(said)
+        return said
 
     def left(self) -> SceneWork:
         """What a process that died has not done."""
@@ -141,12 +136,11 @@ def _serve(pipe: Connection, setup: Setup) -> None:
         while True:
             work = pipe.recv()
             for outcome in bench.run(work):
-                pipe.send(("outcome", outcome))
-            pipe.send(("done", None))
+                pipe.send(outcome)
+            pipe.send(None)
     except (EOFError, BrokenPipeError):
         pass
     except Exception as error:
-        words = str(error) if isinstance(error, RipError) else f"unexpected {type(error).__name__}: {error}"
-        pipe.send(("error", (words, traceback.format_exc())))
+        pipe.send(Trouble.of(error))
     finally:
         bench.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -90,6 +91,29 @@ class SceneWork:
                     failed[outcome.key] = outcome
         plans = tuple(variant for variant in self.plans if variant not in planned)
         return replace(self, done=frozenset(done), failed=tuple(failed.values()), plans=plans)
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """An error that ended a worker's work, in words that travel: errors themselves need not survive a pipe."""
+
+    words: str
+    exit_code: int
+    trace: str
+
+    @classmethod
+    def of(cls, error: Exception) -> Trouble:
+        """To be called where ``error`` was caught."""
+        if isinstance(error, RipError):
+            return cls(str(error), error.exit_code, traceback.format_exc())
+        return cls(f"unexpected {type(error).__name__}: {error}", RipError.exit_code, traceback.format_exc())
+
+    def as_error(self) -> RipError:
+        """The error to raise where the rows are kept; ``--debug`` shows the worker's trace."""
+        error = RipError(self.words)
+        error.exit_code = self.exit_code
+        error.add_note(self.trace)
+        return error
 
 
 class Hands(Protocol):
