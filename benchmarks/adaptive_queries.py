@@ -33,7 +33,7 @@ MOST = 10  # samples a scene
 TEMPERATURE = 0.7
 SHARES = (0.0, 0.2, 0.4)  # of the candidates that are hallucinated
 DRAWS = 10  # of which candidates those are, for each scene
-THRESHOLDS = tuple(sorted({0.3, 0.4, 0.5, 0.6, 0.7, 0.8, ENOUGH_CONFIDENCE}))
+THRESHOLDS = tuple(sorted({0.2, 0.3, 0.4, 0.6, 0.8, ENOUGH_CONFIDENCE}))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from robust_instant_policy.trajectory import Trajectory
 
 DOF = 1.5  # ν of the paper, chosen there for the success rate
 FIRST_QUERIES = 3  # with adaptive queries: the fewest among which one hallucination can be told
-ENOUGH_CONFIDENCE = 0.8  # with adaptive queries: above it, no more are asked
+ENOUGH_CONFIDENCE = 0.3  # with adaptive queries: above it, no more are asked (chosen in docs/prompts.md)
 
 
 class RobustInstantPolicy(KeypointActionTokens):
