@@ -248,3 +248,8 @@ def test_what_a_dead_worker_had_finished_is_not_handed_out_again():
     assert left.plans == (RIP,)
     examined = Analysis(Failure(scene, KAT, 0, "samples", True, False, 0.01, False))
     assert left.without([examined]).failed == ()
+
+
+def test_a_training_budget_is_part_of_what_was_trained_and_of_nothing_else():
+    suite = make_suites(["table1"], Choice(RIP, tasks=["push-cube"], methods=["rip", "kat-dp"], steps=70))[0]
+    assert [variant.steps for variant in suite.variants] == [None, 70]

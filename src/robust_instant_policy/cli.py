@@ -273,9 +273,9 @@ def _eval(options: argparse.Namespace) -> int:
         layout=options.layout,
         features=options.features,
         model=model_name(options.llm),
-        steps=options.steps or DEFAULT_STEPS,
     )
-    choice = Choice(base, options.tasks, options.methods, options.episodes, options.seed, options.objects)
+    steps = options.steps or DEFAULT_STEPS
+    choice = Choice(base, options.tasks, options.methods, options.episodes, options.seed, options.objects, steps)
     setup = Setup(
         llm=options.llm,
         replay=options.replay,

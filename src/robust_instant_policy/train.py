@@ -64,7 +64,9 @@ def _picture(losses: np.ndarray, rehearsals: Sequence[Rehearsal]) -> bytes:
             axis.plot(1e3 * rehearsal.shown[:, place], color=colour, linewidth=1.6, alpha=0.6, label=name)
         axis.set(xlabel="step", title=f"demonstration {index}")
     axes[0].set_ylabel("palm, mm")
-    axes[0].legend(title="— shown\n- - sampled", frameon=False)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside right upper", title="solid: shown\ndashed: sampled"
+    )
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg")
     return buffer.getvalue()

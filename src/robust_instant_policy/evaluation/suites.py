@@ -10,6 +10,7 @@ from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.evaluation.scenes import scene_seed
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.policies import METHOD_NAMES
+from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.tasks import TASK_NAMES
 
 SIMULATION_TASKS = ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")
@@ -63,7 +64,10 @@ class Suite:
 
 @dataclass(frozen=True)
 class Choice:
-    """What the user asked for; None where the suite decides as the paper does."""
+    """What the user asked for; None where the suite decides as the paper does.
+
+    ``steps`` is how long methods are trained that must be: the ``base`` may be one that need not.
+    """
 
     base: Variant
     tasks: Sequence[str] | None = None
@@ -71,6 +75,7 @@ class Choice:
     num_scenes: int = 10
     seed: int = 0
     objects: str = "seen"
+    steps: int = DEFAULT_STEPS
 
 
 def make_suite(name: str, choice: Choice) -> Suite:
@@ -95,11 +100,7 @@ def _tasks(choice: Choice, of_paper: Sequence[str]) -> list[str]:
 
 
 def _methods(choice: Choice, default: Sequence[str] = METHOD_NAMES) -> list[Variant]:
-    return [_with_method(choice.base, method) for method in choice.methods or default]
-
-
-def _with_method(base: Variant, method: str) -> Variant:
-    return replace(base, method=method)
+    return [replace(choice.base, method=method, steps=choice.steps) for method in choice.methods or default]
 
 
 def _table1(choice: Choice) -> tuple[list[str], list[Variant]]:

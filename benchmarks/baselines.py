@@ -1,0 +1,62 @@
+"""What baselines reach and what they cost: success, seconds of training, seconds of planning, from runs of `rip eval`.
+
+rip eval --methods kat-dp --demos 200 --episodes 20 --out runs/proof    (and the like)
+python benchmarks/baselines.py runs/proof runs/five --checkpoints checkpoints --table docs/tables/baselines.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections import defaultdict
+from contextlib import closing
+from pathlib import Path
+from statistics import median
+
+from robust_instant_policy.evaluation import Episode, open_episodes, wilson_interval
+from robust_instant_policy.policies.diffusion import checkpoint
+
+NAME = re.compile(r"(?P<method>kat-dp|dp)-(?P<task>.+)-(?P<demos>\d+)-[0-9a-f]+")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders that rip eval wrote")
+    parser.add_argument("--checkpoints", type=Path, default=Path("checkpoints"))
+    parser.add_argument("--table", type=Path, required=True)
+    options = parser.parse_args()
+    rows: dict[tuple, list[Episode]] = defaultdict(list)
+    for run in options.runs:
+        with closing(open_episodes(run)) as episodes:
+            for row in episodes.rows:
+                rows[row.scene.task, row.variant.demos, row.variant.method, row.variant.steps].append(row)
+    trained = training_seconds(options.checkpoints)
+    lines = [
+        "| task | demonstrations | method | success | 95% interval | training | in | planning (median) |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for (task, demos, method, steps), own in sorted(rows.items(), key=lambda item: item[0][:2]):
+        successes = sum(row.success for row in own)
+        low, high = wilson_interval(successes, len(own))
+        training = "none" if steps is None else f"{steps} steps"
+        seconds = "0 s" if steps is None else f"{trained[method, task, demos, steps]:.0f} s"
+        planning = median(row.seconds for row in own)
+        rate = f"{successes}/{len(own)} | {low:.0%} to {high:.0%}"
+        lines.append(f"| {task} | {demos} | {method} | {rate} | {training} | {seconds} | {planning:.2f} s |")
+    options.table.write_text("\n".join(lines) + "\n")
+    print(options.table.read_text())
+
+
+def training_seconds(folder: Path) -> dict[tuple[str, str, int, int], float]:
+    """Of every finished checkpoint in ``folder``: method, task, demonstrations and steps to seconds."""
+    seconds = {}
+    for path in folder.glob("*.safetensors"):
+        name = NAME.fullmatch(path.stem)
+        if name:
+            tensors, facts = checkpoint.load(path)
+            seconds[name["method"], name["task"], int(name["demos"]), len(tensors["losses"])] = facts["seconds"]
+    return seconds
+
+
+if __name__ == "__main__":
+    main()
