@@ -1,8 +1,10 @@
 """How fast an evaluation runs when its samples are replayed, where the time goes, and what a second worker brings.
 
-python benchmarks/evaluation.py --samples runs/paper/samples.sqlite --out docs/tables/evaluation_speed.md
+python benchmarks/evaluation.py --samples runs/speed/samples.sqlite --out docs/tables/evaluation_speed.md [--scaling]
 
-The samples must hold the scenes of `rip eval --suite table1` for the tasks and methods measured here.
+The samples must hold the scenes of `rip eval` for the tasks and methods measured here. Shares are of processor time, so
+that they do not depend on what else the machine does; --scaling compares one worker with two by the clock and wants a
+machine with two cores to itself.
 """
 
 from __future__ import annotations
@@ -36,8 +38,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path("data"))
     parser.add_argument("--samples", type=Path, required=True)
-    parser.add_argument("--tasks", nargs="+", default=["push-cube", "turn-faucet", "close-cabinet", "open-drawer"])
+    parser.add_argument("--tasks", nargs="+", default=["push-cube", "turn-faucet", "pick-banana"])
     parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--scaling", action="store_true")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     base = Variant("rip", model=model_name("embedded"))
@@ -47,7 +50,8 @@ def main() -> None:
         shutil.copy(options.samples, store)
         setup = Setup("embedded", True, store, options.data, 300.0, films=False)
         lines = _shares(suite, setup)
-        lines += ["", *_scaling(suite, setup, Path(folder))]
+        if options.scaling:
+            lines += ["", *_scaling(suite, setup, Path(folder))]
     lines += ["", f"{os.cpu_count()} cores; load of the machine while measuring {os.getloadavg()[1]:.1f}."]
     text = "\n".join(lines) + "\n"
     print(text)
@@ -56,9 +60,9 @@ def main() -> None:
 
 
 def _shares(suite: Suite, setup: Setup) -> list[str]:
-    """One worker, its parts timed; the time before the first scene of a task (simulator, fitting) is left out."""
+    """One worker, its parts timed; what comes before the second scene of a task (simulator, fitting) is left out."""
     lines = [
-        f"| task | executions | a minute and core | {' | '.join(PARTS)} | rest |",
+        f"| task | executions | in a minute of a core | {' | '.join(PARTS)} | rest |",
         f"| --- | --- | --- | {' | '.join('---' for _ in PARTS)} | --- |",
     ]
     bench = Workbench(setup)
@@ -67,9 +71,9 @@ def _shares(suite: Suite, setup: Setup) -> list[str]:
         list(bench.run(SceneWork(first, suite.variants)))
         spent: dict[str, float] = defaultdict(float)
         undo = _time_parts(bench, spent)
-        start = time.perf_counter()
+        start = time.process_time()
         rows = [row for scene in others for row in bench.run(SceneWork(scene, suite.variants)) if _is_episode(row)]
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
         undo()
         shares = [spent[part] / seconds for part in PARTS]
         cells = " | ".join(f"{share:.0%}" for share in (*shares, 1 - sum(shares)))
@@ -92,10 +96,10 @@ def _time_parts(bench: Workbench, spent: dict[str, float]) -> Callable[[], None]
         original = getattr(owner, name)
 
         def call(*arguments: Any, **named: Any) -> Any:
-            start, before = time.perf_counter(), spent[without] if without else 0.0
+            start, before = time.process_time(), spent[without] if without else 0.0
             result = original(*arguments, **named)
             inner = spent[without] - before if without else 0.0
-            spent[part] += time.perf_counter() - start - inner
+            spent[part] += time.process_time() - start - inner
             return result
 
         setattr(owner, name, call)
