@@ -4,8 +4,10 @@
     python benchmarks/perception.py picture              # docs/images/keypoints.jpg
     python benchmarks/perception.py speed                # ratios to the bare network, in one run
     python benchmarks/perception.py speed --reference CHECKOUT    # beside ShirAmir/dino-vit-features
+    python benchmarks/perception.py speed --features dino --columns real      # one line of the table anew
 
-Writes `docs/tables/perception_accuracy.md` and `docs/tables/perception_speed.md`.
+Writes `docs/tables/perception_accuracy.md` and `docs/tables/perception_speed.md`; keeps each line of the latter in
+`results/perception_speed.json`.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ from robust_instant_policy.perception.vit_checkpoint import load_checkpoint
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 
-TABLES = Path(__file__).parent.parent / "docs" / "tables"
+ROOT = Path(__file__).parent.parent
+TABLES, KEPT_SPEED = ROOT / "docs" / "tables", ROOT / "results" / "perception_speed.json"
 DEMONSTRATIONS, NEW_SCENES = 10, 20
 FIRST_NEW_SEED = 100_000  # demonstrations count from 0
 ROUNDS = {"dino": 1, "efficientnet": 15}  # of each measurement; the least of them counts
@@ -152,18 +155,19 @@ def measure_speed(features: str, settings: DescriptorSettings, shape: tuple[int,
             with torch.inference_mode():
                 network(batch)
 
-    extractor.fit(images[:DEMONSTRATIONS])  # the first call loads weights
+    fit = processor_time(lambda: extractor.fit(images[:DEMONSTRATIONS]))  # loads weights, too
     view, _ = extractor._view(images[-1])
     work: dict[str, Callable[[], object]] = {
         "bare": bare,
-        "fit": lambda: extractor.fit(images[:DEMONSTRATIONS]),
         "locate": lambda: extractor.locate(images[-1]),
         "describe": lambda: extractor._network.describe(images[-1].rgb),
         "see": lambda: extractor._view(images[-1]),
         "follow": lambda: [thing.find(view) for thing in extractor._objects],
     }
+    if features == "efficientnet":
+        work["fit"] = lambda: extractor.fit(images[:DEMONSTRATIONS])
     rounds = ROUNDS[features]
-    times = {name: min(processor_time(one) for _ in range(rounds)) for name, one in work.items()}
+    times = {"fit": fit} | {name: min(processor_time(one) for _ in range(rounds)) for name, one in work.items()}
     times["see"] -= times["describe"]
     return Speed(**times, peak_gib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
 
@@ -189,36 +193,47 @@ def reference_time(checkout: Path, settings: DescriptorSettings, shape: tuple[in
     return processor_time(describe)
 
 
-def speed(checkout: Path | None) -> None:
+def speed(features: list[str], columns: list[str], checkout: Path | None) -> None:
+    one_thread = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        weights = str(Path(folder) / "model.safetensors")
+        save_file(dict(random_checkpoint(0).tensors), weights)
+        for column in columns:
+            for name in features:
+                command = [sys.executable, __file__, "one", name, column, weights]
+                output = subprocess.run(command, check=True, capture_output=True, text=True, env=one_thread).stdout
+                found = json.loads(output)
+                if checkout is not None and name == "dino":
+                    found["reference"] = reference_time(checkout, *COLUMNS[column], weights)
+                kept = json.loads(KEPT_SPEED.read_text()) if KEPT_SPEED.exists() else {}
+                KEPT_SPEED.write_text(json.dumps(kept | {f"{name}, {column}": found}, indent=1) + "\n")
+                print(f"{name}, {column}: {found}", flush=True)
+    write_speed()
+
+
+def write_speed() -> None:
+    """The table from what is kept; ends the command with an error where a line needs too much memory."""
     rows = [
         "| features | column | bare pass | 10 demonstrations / 10 passes | new observation / pass "
         "| describe, see, follow | peak memory | reference, one image |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    one_thread = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    torch.set_num_threads(1)
     greedy = []
-    with tempfile.TemporaryDirectory() as folder:
-        weights = str(Path(folder) / "model.safetensors")
-        save_file(dict(random_checkpoint(0).tensors), weights)
-        for column, (settings, shape) in COLUMNS.items():
-            for features in ("dino", "efficientnet"):
-                command = [sys.executable, __file__, "one", features, column, weights]
-                output = subprocess.run(command, check=True, capture_output=True, text=True, env=one_thread).stdout
-                found = Speed(**json.loads(output))
-                beside = "—"
-                if checkout is not None and features == "dino":
-                    beside = f"{reference_time(checkout, settings, shape, weights):.1f} s"
-                stages = ", ".join(f"{seconds * 1e3:.0f}" for seconds in (found.describe, found.see, found.follow))
-                fit, locate = found.fit / DEMONSTRATIONS / found.bare, found.locate / found.bare
-                rows.append(
-                    f"| {features} | {column} | {found.bare * 1e3:.0f} ms | {fit:.2f} | {locate:.2f} "
-                    f"| {stages} ms | {found.peak_gib:.2f} GiB | {beside} |"
-                )
-                print(rows[-1], flush=True)
-                (TABLES / "perception_speed.md").write_text("\n".join(rows) + "\n")
-                if found.peak_gib > MOST_MEMORY_GIB:
-                    greedy.append(f"{features} at the {column} setting needs {found.peak_gib:.2f} GiB")
+    for name, values in sorted(json.loads(KEPT_SPEED.read_text()).items()):
+        features, column = name.split(", ")
+        reference = values.pop("reference", None)
+        found = Speed(**values)
+        fit, locate = found.fit / DEMONSTRATIONS / found.bare, found.locate / found.bare
+        stages = ", ".join(f"{seconds * 1e3:.0f}" for seconds in (found.describe, found.see, found.follow))
+        rows.append(
+            f"| {features} | {column} | {found.bare * 1e3:.0f} ms | {fit:.2f} | {locate:.2f} | {stages} ms "
+            f"| {found.peak_gib:.2f} GiB | {'—' if reference is None else f'{reference:.1f} s'} |"
+        )
+        if found.peak_gib > MOST_MEMORY_GIB:
+            greedy.append(f"{name} needs {found.peak_gib:.2f} GiB")
+    (TABLES / "perception_speed.md").write_text("\n".join(rows) + "\n")
+    print("\n".join(rows))
     if greedy:
         sys.exit(f"more than {MOST_MEMORY_GIB:g} GiB: {'; '.join(greedy)}")
 
@@ -228,7 +243,10 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("accuracy").add_argument("--tasks", nargs="*", default=list(TASK_NAMES))
     commands.add_parser("picture").add_argument("--task", default="open-drawer")
-    commands.add_parser("speed").add_argument("--reference", type=Path)
+    quick = commands.add_parser("speed")
+    quick.add_argument("--reference", type=Path)
+    quick.add_argument("--features", nargs="+", choices=list(ROUNDS), default=list(ROUNDS))
+    quick.add_argument("--columns", nargs="+", choices=list(COLUMNS), default=list(COLUMNS))
     one = commands.add_parser("one", help="(used by speed)")
     for name in ("features", "column", "weights"):
         one.add_argument(name)
@@ -238,7 +256,7 @@ def main() -> None:
     elif arguments.command == "picture":
         picture(arguments.task)
     elif arguments.command == "speed":
-        speed(arguments.reference)
+        speed(arguments.features, arguments.columns, arguments.reference)
     else:
         speed_of_one(arguments.features, arguments.column, arguments.weights)
 
