@@ -22,7 +22,7 @@ from robust_instant_policy.tasks.aloha.surfaces import (
 from robust_instant_policy.tasks.textures import Color, bristles, wood
 
 BOX = mujoco.mjtGeom.mjGEOM_BOX
-BRISTLE_FRICTION, WOOD_FRICTION, PAN_FRICTION = 0.25, 0.7, 0.3
+BRISTLE_FRICTION, WOOD_FRICTION, PAN_FRICTION = 0.4, 0.7, 0.3
 BEECH: Color = (0.72, 0.52, 0.30)
 BRISTLES: Color = (0.16, 0.15, 0.15)
 PAN_BLUE: Color = (0.12, 0.32, 0.62)
@@ -40,6 +40,7 @@ class Brush:
 
     MASS_KG: ClassVar[float] = 0.12
     BACK_M: ClassVar[float] = 0.012
+    TIPS_M: ClassVar[float] = 0.008
     HANDLE_M: ClassVar[tuple[float, float]] = (0.020, 0.024)
     # Bristles bend: they press with a few newtons when they are some millimetres too low.
     SOFT: ClassVar[dict] = dict(priority=1, solref=[0.045, 1.0], solimp=[0.2, 0.9, 0.008, 0.5, 2.0])
@@ -66,6 +67,10 @@ class Brush:
             add_surface(spec, body, f"{name}-{part}", moved(box_surface(size), place), image, shine=0.1)
             touch = dict(friction=BRISTLE_FRICTION, **self.SOFT) if part == "bristles" else dict(friction=WOOD_FRICTION)
             add_solid(body, BOX, np.array(size) / 2, position=place, mass=mass * self.MASS_KG, **touch)
+        # Above their tips the bristles stand firm: what they are pushed against does not get under them.
+        firm = self.bristle_length - self.TIPS_M
+        size, place = (self.depth, self.width, firm), (0.0, 0.0, self.TIPS_M + firm / 2)
+        add_solid(body, BOX, np.array(size) / 2, position=place, friction=BRISTLE_FRICTION)
         return body
 
 

@@ -17,19 +17,20 @@ from robust_instant_policy.tasks.poses import downward, facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 BRUSH_X_RANGE_M, BRUSH_Y_RANGE_M = (-0.24, -0.20), (0.17, 0.21)
-DUST_X_RANGE_M, DUST_Y_RANGE_M = (-0.15, -0.05), (-0.12, 0.08)
-PAN_X_RANGE_M, PAN_Y_RANGE_M = (0.045, 0.065), (-0.03, 0.03)
-BRUSH_YAW_RAD, PAN_YAW_RAD = np.deg2rad(8), np.deg2rad(8)
+DUST_X_RANGE_M, DUST_Y_RANGE_M = (-0.16, -0.07), (-0.05, 0.05)  # the latter from the pan's middle
+PAN_X_RANGE_M, PAN_Y_RANGE_M = (0.03, 0.05), (-0.04, 0.01)
+BRUSH_YAW_RANGE_RAD, PAN_YAW_RANGE_RAD = np.deg2rad((-8, 8)), np.deg2rad((-6, 6))
 
 TOUCHED_SECONDS = 0.3  # for which the held brush has to touch the table
 
 HOLD_M = 0.052  # of the handle's length, from its top
 ABOVE_M = 0.05
 LIFT_M = 0.06
+AIM_SHARE = 0.4  # of the dust's offset from the pan's middle that is left at the lip
+AWAY_M = 0.04  # that the brush is lifted by at the end
 BEHIND_M = 0.045  # of the dust's near side, where the brush comes down
 PRESS_M = 0.002  # of the bristles into the table
-INTO_M = 0.040  # past the lip: how far the brush goes
-AIM_SHARE = 0.35  # of the dust's offset from the pan's middle that is left at the lip
+INTO_M = 0.055  # how far the brush goes on from the lip
 
 
 class SweepEnv(AlohaEnv):
@@ -44,13 +45,12 @@ class SweepEnv(AlohaEnv):
         self.dust = draw_object(families, self.objects, self.draw("shape"))
         self.brush, self.pan = Brush(seed=int(self.draw("brush").integers(2**31))), Dustpan()
         rng = self.draw("pose")
-        things = (
-            (self.brush, "brush", BRUSH_X_RANGE_M, BRUSH_Y_RANGE_M, BRUSH_YAW_RAD),
-            (self.dust, "dust", DUST_X_RANGE_M, DUST_Y_RANGE_M, np.pi),
-            (self.pan, "dustpan", PAN_X_RANGE_M, PAN_Y_RANGE_M, PAN_YAW_RAD),
-        )
-        for thing, name, x, y, yaw in things:
-            thing.build(spec, name, facing(rng.uniform(*x), rng.uniform(*y), rng.uniform(-yaw, yaw)))
+        brush = facing(rng.uniform(*BRUSH_X_RANGE_M), rng.uniform(*BRUSH_Y_RANGE_M), rng.uniform(*BRUSH_YAW_RANGE_RAD))
+        pan = facing(rng.uniform(*PAN_X_RANGE_M), rng.uniform(*PAN_Y_RANGE_M), rng.uniform(*PAN_YAW_RANGE_RAD))
+        y = pan[1, 3] + rng.uniform(*DUST_Y_RANGE_M)
+        self.brush.build(spec, "brush", brush)
+        self.pan.build(spec, "dustpan", pan)
+        self.dust.build(spec, "dust", facing(rng.uniform(*DUST_X_RANGE_M), y, rng.uniform(-np.pi, np.pi)))
         self._touched = 0.0
 
     def advance(self, command: FloatArray) -> None:
@@ -72,16 +72,14 @@ def sweep(env: SweepEnv, rng: np.random.Generator) -> list[Stroke]:
     hold = env.brush.height - HOLD_M
     x, y = brush[:2, 3].tolist()
 
-    lip = transform_points(pan, [0.0, AIM_SHARE * transform_points(invert_pose(pan), dust[:3, 3])[1], 0.0])
-    push = lip - dust[:3, 3]
-    along = float(np.arctan2(push[1], push[0]))
-    ahead = np.array([np.cos(along), np.sin(along)])
+    # The brush stays square to the table and goes from behind the dust towards the pan's middle.
     reach = max(env.dust.size[:2]) / 2 + env.brush.depth / 2
-    start = dust[:2, 3] - (reach + BEHIND_M) * ahead
-    stop = lip[:2] + (INTO_M - env.brush.depth / 2) * ahead
+    start = dust[:2, 3] - np.array([reach + BEHIND_M, 0.0])
+    lip = np.array([pan[0, 3] - env.brush.depth / 2, pan[1, 3] + AIM_SHARE * (dust[1, 3] - pan[1, 3])])
+    stop = lip + np.array([INTO_M, 0.0])
 
     def at(place: FloatArray, height: float) -> FloatArray:
-        return downward(float(place[0]), float(place[1]), height, along)
+        return downward(float(place[0]), float(place[1]), height)
 
     return [
         Stroke(np.array([downward(x, y, env.brush.height + ABOVE_M, yaw)]), closed=False, free=True, error=0.003),
@@ -90,13 +88,13 @@ def sweep(env: SweepEnv, rng: np.random.Generator) -> list[Stroke]:
         Stroke(at(start, hold + LIFT_M)[None], closed=True, speed=0.20, error=0.004),
         Stroke(at(start, hold - PRESS_M)[None], closed=True, speed=0.10, error=0.0015, pause=0.2),
         Stroke(
-            np.array([at(lip[:2] - 0.5 * env.brush.depth * ahead, hold - PRESS_M), at(stop, hold + env.pan.floor)]),
+            np.array([at(lip, hold - PRESS_M), at(stop, hold + env.pan.floor)]),
             closed=True,
             speed=0.09,
             error=0.0015,
             pause=0.2,
         ),
-        Stroke(at(stop, hold + LIFT_M)[None], closed=True, speed=0.12, error=0.004),
+        Stroke(at(stop, hold + AWAY_M)[None], closed=True, speed=0.12, error=0.004),
     ]
 
 
