@@ -161,14 +161,15 @@ def test_diffusion_policy_learns_recorded_images_and_a_kill_does_not_matter(
     filmed, tmp_path, monkeypatch, small_images
 ):
     demonstrations = load_demonstrations(filmed)
-    policy = ImageDiffusion(Training(tmp_path / "whole", steps=40)).fit(demonstrations)
+    policy = ImageDiffusion(Training(tmp_path / "whole", steps=26)).fit(demonstrations)
     losses = policy.trained_.losses
     assert losses[-10:].mean() < 0.6 * losses[:5].mean()
     assert policy.rate_hz == 11.0
-    monkeypatch.setattr(training, "SAVE_EVERY_S", 0.5)
+    monkeypatch.setattr(training, "SAVE_EVERY_S", 0.3)
     with pytest.raises(Killed):
-        ImageDiffusion(Training(tmp_path / "cut", steps=40, report=killed_at(30))).fit(demonstrations)
-    resumed = ImageDiffusion(Training(tmp_path / "cut", steps=40)).fit(demonstrations)
+        ImageDiffusion(Training(tmp_path / "cut", steps=26, report=killed_at(18))).fit(demonstrations)
+    assert list((tmp_path / "cut").glob("*.unfinished.safetensors"))
+    resumed = ImageDiffusion(Training(tmp_path / "cut", steps=26)).fit(demonstrations)
     one, other = load_file(policy.trained_.path), load_file(resumed.trained_.path)
     assert all(torch.equal(one[name], other[name]) for name in one)
     rehearsal = policy.rehearse(1)[0]
