@@ -14,6 +14,7 @@ from pathlib import Path
 from statistics import median
 
 from robust_instant_policy.evaluation import Episode, open_episodes, wilson_interval
+from robust_instant_policy.evaluation.episodes import EpisodeKey
 from robust_instant_policy.policies.diffusion import checkpoint
 
 NAME = re.compile(r"(?P<method>kat-dp|dp)-(?P<task>.+)-(?P<demos>\d+)-[0-9a-f]+")
@@ -25,17 +26,18 @@ def main() -> None:
     parser.add_argument("--checkpoints", type=Path, default=Path("checkpoints"))
     parser.add_argument("--table", type=Path, required=True)
     options = parser.parse_args()
-    rows: dict[tuple, list[Episode]] = defaultdict(list)
+    rows: dict[tuple, dict[EpisodeKey, Episode]] = defaultdict(dict)  # what two runs did counts once
     for run in options.runs:
         with closing(open_episodes(run)) as episodes:
             for row in episodes.rows:
-                rows[row.scene.task, row.variant.demos, row.variant.method, row.variant.steps].append(row)
+                rows[row.scene.task, row.variant.demos, row.variant.method, row.variant.steps][row.key] = row
     trained = training_seconds(options.checkpoints)
     lines = [
         "| task | demonstrations | method | success | 95% interval | training | in | planning (median) |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for (task, demos, method, steps), own in sorted(rows.items(), key=lambda item: item[0][:2]):
+    for (task, demos, method, steps), by_key in sorted(rows.items(), key=lambda item: item[0][:2]):
+        own = by_key.values()
         successes = sum(row.success for row in own)
         low, high = wilson_interval(successes, len(own))
         training = "none" if steps is None else f"{steps} steps"
