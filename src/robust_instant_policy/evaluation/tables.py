@@ -132,13 +132,15 @@ def demos_table(summary: Summary) -> Table:
                 cells.append(NONE)
                 continue
             low, high = pooled.interval
-            cells.append(f"{_spread(summary, of_count[count])} ({100 * low:.0f} to {100 * high:.0f})")
+            cells.append(
+                f"{_spread(summary, of_count[count])} ({100 * low:.0f} to {100 * high:.0f}, n={pooled.trials})"
+            )
         rows.append((method, *cells))
     return Table(
         ("method", *(f"{count} shown" for count in counts)),
         tuple(rows),
         f"Success in percent, mean ± standard deviation over {', '.join(summary.tasks)}; in parentheses Wilson's 95% "
-        "interval of all executions together.",
+        "interval of all n executions together.",
     )
 
 
