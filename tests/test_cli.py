@@ -33,6 +33,7 @@ def refused(arguments: list[str], capsys) -> tuple[int, str]:
         (["demo", "--task", "fly"], 2, "push-cube"),
         (["record", "--task", "fly", "--out", "x"], 2, "push-cube"),
         (["record", "--task", "push-cube", "--assets", "maniskill", "--out", "x"], 2, "known: code"),
+        (["eval", "--assets", "maniskill", "--out", "x"], 2, "known: code"),
         (["eval", "--tasks", "fly", "--out", "x"], 2, "push-cube"),
         (["eval", "--methods", "magic", "--out", "x"], 2, "rip-gauss"),
         (["demo", "--demos", "0"], 2, "at least once"),

@@ -83,9 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument(
         "--every", type=_positive, default=1, metavar="N", help="keep every N-th step only: 5 of 55 Hz leaves 11 Hz"
     )
-    record.add_argument(
-        "--assets", choices=("code", "maniskill"), default="code", help="built in code, or ManiSkill's downloads"
-    )
+    _assets_option(record)
     record.add_argument("--out", type=Path, required=True, metavar="DIR")
 
     plan = command("plan", _plan, "plan for one observation and write plan.json; nothing moves")
@@ -115,6 +113,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--objects", choices=("seen", "unseen"), default="seen", help="test with objects like those shown, or others"
     )
+    _assets_option(evaluate)
     evaluate.add_argument("--steps", type=_positive, metavar="N", help="how long dp and kat-dp are trained")
     evaluate.add_argument(
         "--checkpoints", type=Path, default=DEFAULT_CHECKPOINTS, metavar="DIR", help="where trained weights are"
@@ -161,6 +160,12 @@ def _parser() -> argparse.ArgumentParser:
 
     command("doctor", _doctor, "what works on this machine, and what to do about what does not")
     return parser
+
+
+def _assets_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--assets", choices=("code", "maniskill"), default="code", help="objects made in code, or ManiSkill's downloads"
+    )
 
 
 def _method_options(parser: argparse.ArgumentParser) -> None:
@@ -275,12 +280,14 @@ def _eval(options: argparse.Namespace) -> int:
         model=model_name(options.llm),
     )
     steps = options.steps or DEFAULT_STEPS
-    choice = Choice(base, options.tasks, options.methods, options.episodes, options.seed, options.objects, steps)
+    choice = Choice(
+        base, options.tasks, options.methods, options.episodes, options.seed, options.objects, options.assets, steps
+    )
     setup = Setup(
         llm=options.llm,
         replay=options.replay,
         store=options.out / STORE_FILE,
-        data=DEFAULT_DATA,
+        data=DEFAULT_DATA if options.assets == "code" else DEFAULT_DATA / options.assets,
         deadline_s=float(options.deadline),
         films=not options.no_videos,
         checkpoints=options.checkpoints,

@@ -138,6 +138,7 @@ def missing_work(
 
 
 def _record_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:
+    assets = works[0].scene.assets
     most: dict[tuple[str, bool], int] = {}
     for work in works:
         needs = {(work.scene.task, False): work.demos}
@@ -149,7 +150,7 @@ def _record_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress
         folder = demonstrations_folder(setup.data, name, with_images)
         if count_demonstrations(folder, name) >= count:
             continue
-        task = make_task(name)
+        task = make_task(name, assets=assets)
         try:
             obtain_demonstrations(
                 task, folder, count, lambda *so_far, name=name: progress.recording(name, *so_far), with_images

@@ -38,7 +38,7 @@ class Session:
 
 @dataclass(frozen=True)
 class Manifest:
-    """All that ``run.json`` says: suites of one name and set of objects are one, sessions are oldest first."""
+    """All that ``run.json`` says: suites of one name and the same objects are one, sessions are oldest first."""
 
     suites: tuple[Suite, ...] = ()
     sessions: tuple[Session, ...] = ()
@@ -62,16 +62,23 @@ class Manifest:
         write_whole(folder / MANIFEST_FILE, text.encode())
 
     def with_suites(self, suites: Iterable[Suite]) -> Manifest:
-        known = {(suite.name, suite.objects): suite for suite in self.suites}
+        known = {(suite.name, suite.objects, suite.assets): suite for suite in self.suites}
         for suite in suites:
-            key = suite.name, suite.objects
+            key = suite.name, suite.objects, suite.assets
             known[key] = known[key].merged(suite) if key in known else suite
         return replace(self, suites=tuple(known.values()))
 
 
 def _suite(content: dict) -> Suite:
     variants = tuple(Variant(**one) for one in content["variants"])
-    return Suite(content["name"], tuple(content["tasks"]), variants, tuple(content["seeds"]), content["objects"])
+    return Suite(
+        content["name"],
+        tuple(content["tasks"]),
+        variants,
+        tuple(content["seeds"]),
+        content["objects"],
+        content.get("assets", "code"),
+    )
 
 
 @contextmanager

@@ -26,13 +26,16 @@ SAMPLING_METHODS = ("rip", "rip-gauss", "kat")  # those of the paper that share 
 
 @dataclass(frozen=True)
 class Suite:
-    """Every one of ``variants`` in the new scenes ``seeds`` of every task, with "seen" or "unseen" ``objects``."""
+    """Every one of ``variants`` in the new scenes ``seeds`` of every task, with "seen" or "unseen" ``objects``, whose
+    shapes come from ``assets``, as in `Scene`.
+    """
 
     name: str
     tasks: tuple[str, ...]
     variants: tuple[Variant, ...]
     seeds: tuple[int, ...]
     objects: str = "seen"
+    assets: str = "code"
 
     def __post_init__(self) -> None:
         for kind, names, known in (
@@ -45,7 +48,7 @@ class Suite:
 
     @property
     def scenes(self) -> list[Scene]:
-        return [Scene(task, self.objects, seed) for task in self.tasks for seed in self.seeds]
+        return [Scene(task, self.objects, seed, self.assets) for task in self.tasks for seed in self.seeds]
 
     @property
     def keeps_plans(self) -> bool:
@@ -53,7 +56,7 @@ class Suite:
         return self.name == "trajectories"
 
     def merged(self, other: Suite) -> Suite:
-        """This and another suite of the same name and objects as one."""
+        """This and another suite of the same name, objects and assets as one."""
         return replace(
             self,
             tasks=tuple(dict.fromkeys((*self.tasks, *other.tasks))),
@@ -75,6 +78,7 @@ class Choice:
     num_scenes: int = 10
     seed: int = 0
     objects: str = "seen"
+    assets: str = "code"
     steps: int = DEFAULT_STEPS
 
 
@@ -86,7 +90,7 @@ def make_suite(name: str, choice: Choice) -> Suite:
     if not tasks:
         raise UsageError(f"none of the chosen tasks is one that suite {name} is about")
     seeds = tuple(scene_seed(choice.seed, index) for index in range(choice.num_scenes))
-    return Suite(name, tuple(tasks), tuple(dict.fromkeys(variants)), seeds, choice.objects)
+    return Suite(name, tuple(tasks), tuple(dict.fromkeys(variants)), seeds, choice.objects, choice.assets)
 
 
 def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:

@@ -63,11 +63,15 @@ class Variant:
 
 @dataclass(frozen=True)
 class Scene:
-    """A drawn scene of ``task``, with ``objects`` that are "seen" in the demonstrations or "unseen"."""
+    """A drawn scene of ``task``, with ``objects`` that are "seen" in the demonstrations or "unseen".
+
+    ``assets`` is where their shapes come from: built in "code", or "maniskill"'s downloads.
+    """
 
     task: str
     objects: str
     seed: int
+    assets: str = "code"
 
     def __str__(self) -> str:
-        return f"{self.task}-{self.objects}-{self.seed}"
+        return f"{self.task}-{self.objects}-{self.seed}" + ("" if self.assets == "code" else f"-{self.assets}")

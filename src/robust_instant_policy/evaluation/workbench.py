@@ -53,7 +53,7 @@ class Workbench:
         self._report = report
         self._demonstrations = demonstrations or self._read_demonstrations
         self._task: Task | None = None
-        self._place = ("", "")  # the task and the set of objects that the simulator holds
+        self._place = ("", "", "")  # the task, the set of objects and their source that the simulator holds
         self._forget()
 
     def run(self, work: SceneWork) -> Iterator[Outcome]:
@@ -97,14 +97,14 @@ class Workbench:
         return RecordedModel(connect(self._setup.llm), store)
 
     def _enter(self, scene: Scene) -> Task:
-        if self._task is None or self._place != (scene.task, scene.objects):
+        if self._task is None or self._place != (place := (scene.task, scene.objects, scene.assets)):
             if self._task is not None:
                 self._task.close()
                 self._task = None
             if self._place[0] != scene.task:
                 self._forget()
-            self._task = make_task(scene.task, scene.objects)
-            self._place = (scene.task, scene.objects)
+            self._task = make_task(scene.task, scene.objects, scene.assets)
+            self._place = place
         return self._task
 
     def _forget(self) -> None:
@@ -183,7 +183,7 @@ class Workbench:
 
     def _truth_of_demonstrations(self, task_name: str, shown: Sequence[Demonstration], demos: int) -> list[SceneTruth]:
         if len(self._shown_truth) < demos:
-            apart = None if self._place[1] == "seen" else make_task(task_name)
+            apart = None if self._place[1] == "seen" else make_task(task_name, assets=self._place[2])
             task = apart or self._task
             assert task is not None
             try:
