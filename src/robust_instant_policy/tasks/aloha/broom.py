@@ -78,7 +78,7 @@ class Brush:
 class Dustpan:
     """Lies on z = 0, its lip along y at x = 0, the pan behind it along x; lengths in metres. Held to the table."""
 
-    width: float = 0.17
+    width: float = 0.19
     depth: float = 0.11
     wall: float = 0.030
     lip: float = 0.020

@@ -17,7 +17,7 @@ from robust_instant_policy.tasks.poses import downward, facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 BRUSH_X_RANGE_M, BRUSH_Y_RANGE_M = (-0.24, -0.20), (0.17, 0.21)
-DUST_X_RANGE_M, DUST_Y_RANGE_M = (-0.16, -0.07), (-0.05, 0.05)  # the latter from the pan's middle
+DUST_X_RANGE_M, DUST_Y_RANGE_M = (-0.16, -0.07), (-0.042, 0.042)  # the latter from the pan's middle
 PAN_X_RANGE_M, PAN_Y_RANGE_M = (0.03, 0.05), (-0.04, 0.01)
 BRUSH_YAW_RANGE_RAD, PAN_YAW_RANGE_RAD = np.deg2rad((-8, 8)), np.deg2rad((-6, 6))
 
@@ -26,7 +26,6 @@ TOUCHED_SECONDS = 0.3  # for which the held brush has to touch the table
 HOLD_M = 0.052  # of the handle's length, from its top
 ABOVE_M = 0.05
 LIFT_M = 0.06
-AIM_SHARE = 0.4  # of the dust's offset from the pan's middle that is left at the lip
 AWAY_M = 0.04  # that the brush is lifted by at the end
 BEHIND_M = 0.045  # of the dust's near side, where the brush comes down
 PRESS_M = 0.002  # of the bristles into the table
@@ -72,10 +71,10 @@ def sweep(env: SweepEnv, rng: np.random.Generator) -> list[Stroke]:
     hold = env.brush.height - HOLD_M
     x, y = brush[:2, 3].tolist()
 
-    # The brush stays square to the table and goes from behind the dust towards the pan's middle.
+    # The brush stays square to the table and goes straight on, over the lip.
     reach = max(env.dust.size[:2]) / 2 + env.brush.depth / 2
     start = dust[:2, 3] - np.array([reach + BEHIND_M, 0.0])
-    lip = np.array([pan[0, 3] - env.brush.depth / 2, pan[1, 3] + AIM_SHARE * (dust[1, 3] - pan[1, 3])])
+    lip = np.array([pan[0, 3] - env.brush.depth / 2, dust[1, 3]])
     stop = lip + np.array([INTO_M, 0.0])
 
     def at(place: FloatArray, height: float) -> FloatArray:
