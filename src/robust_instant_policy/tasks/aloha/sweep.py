@@ -17,8 +17,8 @@ from robust_instant_policy.tasks.poses import downward, facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 BRUSH_X_RANGE_M, BRUSH_Y_RANGE_M = (-0.24, -0.20), (0.17, 0.21)
-DUST_X_RANGE_M, DUST_Y_RANGE_M = (-0.16, -0.07), (-0.042, 0.042)  # the latter from the pan's middle
-PAN_X_RANGE_M, PAN_Y_RANGE_M = (0.03, 0.05), (-0.04, 0.01)
+DUST_X_RANGE_M, DUST_Y_RANGE_M = (-0.16, -0.08), (-0.10, 0.07)
+PAN_AHEAD_RANGE_M, PAN_ASIDE_RANGE_M = (0.115, 0.135), (-0.012, 0.012)  # of the dust: somebody held it there
 BRUSH_YAW_RANGE_RAD, PAN_YAW_RANGE_RAD = np.deg2rad((-8, 8)), np.deg2rad((-6, 6))
 
 TOUCHED_SECONDS = 0.3  # for which the held brush has to touch the table
@@ -45,11 +45,12 @@ class SweepEnv(AlohaEnv):
         self.brush, self.pan = Brush(seed=int(self.draw("brush").integers(2**31))), Dustpan()
         rng = self.draw("pose")
         brush = facing(rng.uniform(*BRUSH_X_RANGE_M), rng.uniform(*BRUSH_Y_RANGE_M), rng.uniform(*BRUSH_YAW_RANGE_RAD))
-        pan = facing(rng.uniform(*PAN_X_RANGE_M), rng.uniform(*PAN_Y_RANGE_M), rng.uniform(*PAN_YAW_RANGE_RAD))
-        y = pan[1, 3] + rng.uniform(*DUST_Y_RANGE_M)
+        x, y = rng.uniform(*DUST_X_RANGE_M), rng.uniform(*DUST_Y_RANGE_M)
+        ahead, aside = rng.uniform(*PAN_AHEAD_RANGE_M), rng.uniform(*PAN_ASIDE_RANGE_M)
+        pan = facing(x + ahead, y + aside, rng.uniform(*PAN_YAW_RANGE_RAD))
         self.brush.build(spec, "brush", brush)
         self.pan.build(spec, "dustpan", pan)
-        self.dust.build(spec, "dust", facing(rng.uniform(*DUST_X_RANGE_M), y, rng.uniform(-np.pi, np.pi)))
+        self.dust.build(spec, "dust", facing(x, y, rng.uniform(-np.pi, np.pi)))
         self._touched = 0.0
 
     def advance(self, command: FloatArray) -> None:
