@@ -24,7 +24,7 @@ from robust_instant_policy.evaluation import (
     paper,
 )
 from robust_instant_policy.evaluation.experiment import missing_work, wanted_plans
-from robust_instant_policy.evaluation.manifest import Manifest, session
+from robust_instant_policy.evaluation.manifest import Manifest, invocation
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test, wilson_interval
 from robust_instant_policy.evaluation.summary import Summary
 from robust_instant_policy.evaluation.tables import tables
@@ -210,12 +210,12 @@ def test_a_run_remembers_its_suites_and_the_commands_that_made_it(tmp_path):
     one = Suite("table1", ("push-cube",), (RIP,), (1,))
     two = Suite("table1", ("turn-faucet",), (Variant("rip-gauss"),), (1, 2))
     for suite in (one, two):
-        with session(tmp_path, [suite], ["rip", "eval", "--out", "a b"], "a model"):
+        with invocation(tmp_path, [suite], ["rip", "eval", "--out", "a b"], "a model"):
             pass
     manifest = Manifest.read(tmp_path)
     assert manifest.suites == (one.merged(two),)
     assert manifest.suites[0].tasks == ("push-cube", "turn-faucet")
-    assert [one.command for one in manifest.sessions] == ["rip eval --out 'a b'"] * 2
+    assert [one.command for one in manifest.invocations] == ["rip eval --out 'a b'"] * 2
 
 
 def test_a_worker_stays_with_its_task_and_others_take_another():

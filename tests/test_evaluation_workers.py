@@ -32,7 +32,7 @@ from robust_instant_policy.evaluation import (
 )
 from robust_instant_policy.evaluation.cluster import Cluster
 from robust_instant_policy.evaluation.failures import Inquest, film, true_keypoints, video_file
-from robust_instant_policy.evaluation.manifest import session
+from robust_instant_policy.evaluation.manifest import invocation
 from robust_instant_policy.evaluation.processes import Processes
 from robust_instant_policy.evaluation.publication import publish
 from robust_instant_policy.policies import KeypointContext, Neighbours
@@ -215,7 +215,7 @@ def test_the_page_tells_every_failure_with_its_film_and_needs_nothing_beside_it(
     failures.close()
     (tmp_path / "videos").mkdir()
     (tmp_path / video_file(*row.key)).write_bytes(film(task, policy, observation, 0))
-    with session(tmp_path, [suite], ["rip", "eval", "--out", "x"], "a model"):
+    with invocation(tmp_path, [suite], ["rip", "eval", "--out", "x"], "a model"):
         pass
     assert "**50** (9 to 91)" in publish(tmp_path)
     page = (tmp_path / "index.html").read_text()
@@ -248,7 +248,7 @@ def test_figures_are_drawn_for_every_analysis(tmp_path):
                 won = bool(rng.random() < 0.7)
                 table.add(Episode(place, variant, 0, 1, won, 1.0, 1.0, 5.0, 9, 0.9, "" if won else "missed"))
     table.close()
-    with session(tmp_path, suites, ["rip", "eval"], "a model"):
+    with invocation(tmp_path, suites, ["rip", "eval"], "a model"):
         pass
     publish(tmp_path)
     for suite in suites:

@@ -9,7 +9,7 @@ from robust_instant_policy.console import StageConsole, TrainingScreen
 from robust_instant_policy.evaluation import Analysis, Episode, Progress, Setup, Suite, run_suites
 from robust_instant_policy.evaluation.cluster import Cluster
 from robust_instant_policy.evaluation.episodes import EPISODES_FILE
-from robust_instant_policy.evaluation.manifest import session
+from robust_instant_policy.evaluation.manifest import invocation
 from robust_instant_policy.evaluation.processes import Processes
 from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
 from robust_instant_policy.evaluation.work import Hands, Outcome
@@ -39,7 +39,7 @@ def evaluate(
             screen.say(f"  {what.scene} {what.variant} #{what.candidate}: {verdict}")
         screen.done_so_far("plans executed", done, total)
 
-    with session(out, suites, arguments, model_name(setup.llm)), screen.stage("evaluation"):
+    with invocation(out, suites, arguments, model_name(setup.llm)), screen.stage("evaluation"):
         run_suites(suites, setup, out, _hands(workers, ray), Progress(recording, outcome, TrainingScreen(screen)))
     screen.say("")
     screen.say(publish(out))

@@ -25,7 +25,7 @@ GIB = 2**30
 
 
 @dataclass(frozen=True)
-class Session:
+class Invocation:
     """One command that added to a folder: when it began (UTC), how long it worked, on what and with which code."""
 
     command: str
@@ -38,10 +38,10 @@ class Session:
 
 @dataclass(frozen=True)
 class Manifest:
-    """All that ``run.json`` says: suites of one name and the same objects are one, sessions are oldest first."""
+    """All that ``run.json`` says: suites of one name and the same objects are one, invocations are oldest first."""
 
     suites: tuple[Suite, ...] = ()
-    sessions: tuple[Session, ...] = ()
+    invocations: tuple[Invocation, ...] = ()
 
     @classmethod
     def read(cls, folder: Path) -> Manifest:
@@ -52,7 +52,8 @@ class Manifest:
         try:
             content = json.loads(path.read_text())
             return cls(
-                tuple(_suite(one) for one in content["suites"]), tuple(Session(**one) for one in content["sessions"])
+                tuple(_suite(one) for one in content["suites"]),
+                tuple(Invocation(**one) for one in content["invocations"]),
             )
         except (KeyError, ValueError, TypeError) as error:
             raise DatasetError(f"{path} is damaged ({error}); move it away and run the same command again") from None
@@ -82,7 +83,7 @@ def _suite(content: dict) -> Suite:
 
 
 @contextmanager
-def session(folder: Path, suites: Sequence[Suite], arguments: Sequence[str], model: str) -> Iterator[None]:
+def invocation(folder: Path, suites: Sequence[Suite], arguments: Sequence[str], model: str) -> Iterator[None]:
     """Note in ``folder/run.json`` what is done meanwhile, whether it ends well or is stopped."""
     manifest = Manifest.read(folder).with_suites(suites)
     manifest.write(folder)
@@ -90,7 +91,7 @@ def session(folder: Path, suites: Sequence[Suite], arguments: Sequence[str], mod
     try:
         yield
     finally:
-        now = Session(
+        now = Invocation(
             command=shlex.join(arguments),
             began=began.isoformat(timespec="seconds"),
             hours=round((time.monotonic() - start) / 3600, 4),
@@ -98,7 +99,7 @@ def session(folder: Path, suites: Sequence[Suite], arguments: Sequence[str], mod
             code=code(),
             model=model,
         )
-        replace(manifest, sessions=(*manifest.sessions, now)).write(folder)
+        replace(manifest, invocations=(*manifest.invocations, now)).write(folder)
 
 
 def machine() -> str:

@@ -77,7 +77,7 @@ def write_page(
     episodes: Sequence[Episode],
     failures: Iterable[Failure],
     failure_table: Table,
-    sessions: Table,
+    invocations: Table,
 ) -> str:
     """The page as text; films of failed episodes are taken from ``folder``."""
     lost = [row for row in episodes if not row.success]
@@ -96,7 +96,7 @@ def write_page(
         failure_table.html(),
         _gallery(folder, lost, {failure.key: failure for failure in failures}),
         "<h2 id=run>What was run</h2>",
-        sessions.html(),
+        invocations.html(),
         "</html>",
     ]
     return "\n".join(parts)

@@ -16,13 +16,13 @@ from robust_instant_policy.evaluation.manifest import Manifest
 from robust_instant_policy.evaluation.page import Section, write_page
 from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.summary import Summary
-from robust_instant_policy.evaluation.tables import Table, failure_table, session_table, tables
+from robust_instant_policy.evaluation.tables import Table, failure_table, invocation_table, tables
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.policies import Plan
 
 TABLE_FILE = "table.md"
 FAILURE_TABLE_FILE = "failures.md"
-SESSIONS_FILE = "run.md"
+RUN_TABLE_FILE = "run.md"
 PAGE_FILE = "index.html"
 
 
@@ -50,9 +50,9 @@ def publish(out: Path) -> str:
     text = _text([table for section in sections for table in section.tables])
     write_whole(out / FAILURE_TABLE_FILE, lost.markdown().encode())
     write_whole(out / TABLE_FILE, text.encode())
-    sessions = session_table(manifest.sessions, rows)
-    write_whole(out / SESSIONS_FILE, sessions.markdown().encode())
-    page = write_page(out, sections, rows, failures, lost, sessions)
+    invocations = invocation_table(manifest.invocations, rows)
+    write_whole(out / RUN_TABLE_FILE, invocations.markdown().encode())
+    page = write_page(out, sections, rows, failures, lost, invocations)
     write_whole(out / PAGE_FILE, page.encode())
     return text
 

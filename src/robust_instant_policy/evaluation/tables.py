@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import STAGES, Failure
-from robust_instant_policy.evaluation.manifest import Session
+from robust_instant_policy.evaluation.manifest import Invocation
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test
 from robust_instant_policy.evaluation.summary import Rate, Summary, reference
 from robust_instant_policy.evaluation.variant import Variant
@@ -167,10 +167,10 @@ def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> T
     )
 
 
-def session_table(sessions: Sequence[Session], episodes: Sequence[Episode]) -> Table:
-    """What was run, where and for how long; sessions of one command are one row."""
+def invocation_table(invocations: Sequence[Invocation], episodes: Sequence[Episode]) -> Table:
+    """What was run, where and for how long; invocations of one command are one row."""
     rows: dict[tuple[str, str, str], list[float]] = {}
-    for one in sessions:
+    for one in invocations:
         rows.setdefault((one.command, one.machine, one.code), []).append(one.hours)
     models = sorted({row.variant.model for row in episodes if row.variant.model})
     shared: dict[tuple, float] = {}  # methods that share samples all count the time it took to get them
@@ -180,12 +180,12 @@ def session_table(sessions: Sequence[Session], episodes: Sequence[Episode]) -> T
     planning = sum(shared.values()) / 3600
     physics = sum(row.physics_seconds for row in episodes) / 3600
     return Table(
-        ("command", "machine", "version", "sessions", "hours"),
+        ("command", "machine", "version", "times", "hours"),
         tuple((f"`{key[0]}`", *key[1:], str(len(hours)), f"{sum(hours):.2f}") for key, hours in rows.items()),
-        f"Language model: {', '.join(models) or 'none was asked'}. First session: {sessions[0].began}. The workers "
+        f"Language model: {', '.join(models) or 'none was asked'}. First begun: {invocations[0].began}. The workers "
         f"planned for {planning:.1f} hours (samples that were stored already cost next to nothing) and executed for "
         f"{physics:.1f}."
-        if sessions
+        if invocations
         else "Nothing is known of the commands that wrote these rows.",
     )
 
