@@ -97,7 +97,8 @@ class Workbench:
         return RecordedModel(connect(self._setup.llm), store)
 
     def _enter(self, scene: Scene) -> Task:
-        if self._task is None or self._place != (place := (scene.task, scene.objects, scene.assets)):
+        place = (scene.task, scene.objects, scene.assets)
+        if self._task is None or self._place != place:
             if self._task is not None:
                 self._task.close()
                 self._task = None
