@@ -188,7 +188,8 @@ def renderer(**environment: str) -> subprocess.CompletedProcess[str]:
 
 def test_a_renderer_is_chosen_without_a_screen_and_the_users_choice_stands():
     assert renderer().stdout.split(",")[0] in ("egl", "osmesa")
-    assert renderer(MUJOCO_GL="osmesa").stdout.startswith("osmesa,")
+    chosen = renderer(MUJOCO_GL="osmesa")  # which need not be there
+    assert chosen.stdout.startswith("osmesa,") or "(osmesa: " in chosen.stderr
 
 
 def test_without_a_renderer_one_line_says_what_to_install():
