@@ -119,7 +119,7 @@ def test_length_of_the_result_can_be_chosen():
 
 def test_bad_arguments_are_refused():
     good = draw_scene(0, "smooth", 3, 0).candidates
-    with pytest.raises(UnknownNameError, match="em, network, mixture, median"):
+    with pytest.raises(UnknownNameError, match="em, network, network-sim, network-real, mixture, median"):
         robust_gripper_trajectory(good, estimator="mean")
     with pytest.raises(InvalidValueError, match=r"\(T_q, 10·A\).*9"):
         robust_gripper_trajectory([c[:, :9] for c in good])
