@@ -24,11 +24,11 @@ import numpy as np
 import torch
 from dino_reference import random_checkpoint
 from numpy.typing import NDArray
-from perception import DEMONSTRATIONS, FIRST_NEW_SEED, NEW_SCENES, processor_time
+from perception import CAMERAS, DEMONSTRATIONS, NEW_SCENES, KnownScenes, processor_time
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from robust_instant_policy.perception import PAPER_SIMULATION, KeypointExtractor, measure
+from robust_instant_policy.perception import PAPER_SIMULATION
 from robust_instant_policy.perception.descriptors import DescriptorMap, DescriptorNetwork
 from robust_instant_policy.perception.efficientnet import (
     NETWORK,
@@ -37,12 +37,10 @@ from robust_instant_policy.perception.efficientnet import (
     load_network,
 )
 from robust_instant_policy.perception.vit import VitDescriptors
-from robust_instant_policy.tasks import TASK_NAMES, make_task
-from robust_instant_policy.tasks.camera_noise import CameraNoise
+from robust_instant_policy.tasks import TASK_NAMES
 
 ROOT = Path(__file__).parents[1]
 KEPT, TABLE = ROOT / "results" / "extractors.jsonl", ROOT / "docs" / "tables" / "extractors.md"
-CAMERAS: dict[str, Any] = {"perfect": None, "noisy": CameraNoise().photograph}
 SETTINGS = PAPER_SIMULATION
 ORIENTATIONS = 8
 GRADIENT_SCALES_PX = (1.5, 3.0, 6.0)  # of the loaded image
@@ -161,21 +159,14 @@ def measure_task(name: str, networks: dict[str, DescriptorNetwork]) -> None:
     kept = read_kept()
     if all((key, name, label) in kept for key in networks for label in CAMERAS):
         return
-    task = make_task(name)
-    images, truths = [], []
-    for seed in [*range(DEMONSTRATIONS), *range(FIRST_NEW_SEED, FIRST_NEW_SEED + NEW_SCENES)]:
-        images.append(task.reset(seed))
-        truths.append(task.scene_truth())  # type: ignore[attr-defined]
-    task.close()
-    shown, new = slice(None, DEMONSTRATIONS), slice(DEMONSTRATIONS, None)
+    scenes = KnownScenes.of(name)
+    image = scenes.images[0].rgb
     for key, network in networks.items():
-        seconds = min(processor_time(lambda network=network: network.describe(images[0].rgb)) for _ in range(TIMINGS))
+        seconds = min(processor_time(lambda network=network: network.describe(image)) for _ in range(TIMINGS))
         for label, camera in CAMERAS.items():
             if (key, name, label) in kept:
                 continue
-            seen = images[shown] if camera is None else [camera(o, 1000 + i) for i, o in enumerate(images[shown])]
-            extractor = KeypointExtractor(features=network, workspace=task.workspace).fit(seen)
-            found = measure(extractor, images[shown], truths[shown], images[new], truths[new], camera)
+            found = scenes.accuracy(network, camera)
             entry = {
                 "key": key, "name": network.name, "task": name, "camera": label, "seconds": seconds,
                 "median": found.median, "worst_tenth": found.worst_tenth, "on_object": found.on_object,

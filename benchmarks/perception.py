@@ -32,13 +32,17 @@ from PIL import Image, ImageDraw
 from safetensors.torch import save_file
 
 from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception import PAPER_REAL, PAPER_SIMULATION, KeypointExtractor, measure
+from robust_instant_policy.perception.accuracy import Accuracy
+from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.efficientnet import load_network
 from robust_instant_policy.perception.settings import DescriptorSettings
 from robust_instant_policy.perception.vit import VitDescriptors
 from robust_instant_policy.perception.vit_checkpoint import load_checkpoint
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
+from robust_instant_policy.tasks.scene_truth import SceneTruth
 
 ROOT = Path(__file__).parent.parent
 TABLES, KEPT_SPEED = ROOT / "docs" / "tables", ROOT / "results" / "perception_speed.json"
@@ -47,7 +51,36 @@ FIRST_NEW_SEED = 100_000  # demonstrations count from 0
 ROUNDS = {"dino": 1, "efficientnet": 15}  # of each measurement; the least of them counts
 MOST_MEMORY_GIB = 2.0
 PICTURE_PX = 360
+Camera = Callable[[Observation, int], Observation]
+CAMERAS: dict[str, Camera | None] = {"perfect": None, "noisy": CameraNoise().photograph}
 COLUMNS = {"simulation": (PAPER_SIMULATION, (100, 100)), "real": (PAPER_REAL, (240, 320))}
+
+
+@dataclass(frozen=True)
+class KnownScenes:
+    """Images of a simulated task with their truth: `DEMONSTRATIONS` that are shown, then `NEW_SCENES`."""
+
+    images: list[Observation]
+    truths: list[SceneTruth]
+    workspace: FloatArray
+
+    @classmethod
+    def of(cls, name: str) -> KnownScenes:
+        task = make_task(name)
+        images, truths = [], []
+        for seed in [*range(DEMONSTRATIONS), *range(FIRST_NEW_SEED, FIRST_NEW_SEED + NEW_SCENES)]:
+            images.append(task.reset(seed))
+            truths.append(task.scene_truth())
+        task.close()
+        return cls(images, truths, task.workspace)
+
+    def accuracy(self, features: str | DescriptorNetwork, camera: Camera | None) -> Accuracy:
+        """Of the keypoints in the new scenes, everything seen through ``camera``."""
+        shown, new = slice(None, DEMONSTRATIONS), slice(DEMONSTRATIONS, None)
+        images, truths = self.images, self.truths
+        seen = images[shown] if camera is None else [camera(o, 1000 + i) for i, o in enumerate(images[shown])]
+        extractor = KeypointExtractor(features=features, workspace=self.workspace).fit(seen)
+        return measure(extractor, images[shown], truths[shown], images[new], truths[new], camera)
 
 
 def accuracy(tasks: list[str]) -> None:
@@ -56,17 +89,9 @@ def accuracy(tasks: list[str]) -> None:
         "| --- | --- | --- | --- | --- |",
     ]
     for name in tasks:
-        task = make_task(name)
-        images, truths = [], []
-        for seed in [*range(DEMONSTRATIONS), *range(FIRST_NEW_SEED, FIRST_NEW_SEED + NEW_SCENES)]:
-            images.append(task.reset(seed))
-            truths.append(task.scene_truth())  # type: ignore[attr-defined]
-        task.close()
-        shown, new = slice(None, DEMONSTRATIONS), slice(DEMONSTRATIONS, None)
-        for label, camera in (("perfect", None), ("noisy", CameraNoise().photograph)):
-            seen = images[shown] if camera is None else [camera(o, 1000 + i) for i, o in enumerate(images[shown])]
-            extractor = KeypointExtractor(features="efficientnet", workspace=task.workspace).fit(seen)
-            found = measure(extractor, images[shown], truths[shown], images[new], truths[new], camera)
+        scenes = KnownScenes.of(name)
+        for label, camera in CAMERAS.items():
+            found = scenes.accuracy("efficientnet", camera)
             row = f"| {name} | {label} | {found.on_object} of {len(found.part_of)} "
             rows.append(row + f"| {found.median * 1e3:.1f} mm | {found.worst_tenth * 1e3:.1f} mm |")
             print(rows[-1], flush=True)

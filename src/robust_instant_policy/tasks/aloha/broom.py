@@ -10,7 +10,9 @@ import numpy as np
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.aloha.surfaces import (
+    VISUAL_GROUP,
     Body,
+    add_hull,
     add_solid,
     add_surface,
     box_surface,
@@ -103,13 +105,6 @@ class Dustpan:
             add_surface(spec, body, f"{name}-{part}", moved(box_surface(size), place), paint(shade), shine=0.3)
             add_solid(body, BOX, np.array(size) / 2, position=place, friction=PAN_FRICTION)
         corners = [(x, y, z) for y in (-half, half) for x, z in ((0, 0), (self.lip, 0), (self.lip, self.floor))]
-        ramp = spec.add_mesh(name=f"{name}-ramp")
-        ramp.uservert = np.array(corners, dtype=np.float32).ravel()
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"{name}-ramp",
-            rgba=[*(1.25 * np.array(PAN_BLUE)), 1.0],
-            friction=[PAN_FRICTION, 5e-3, 2e-4],
-            condim=6,
-        )
+        color = [*(1.25 * np.array(PAN_BLUE)), 1.0]
+        add_hull(spec, body, f"{name}-ramp", corners, friction=PAN_FRICTION, rgba=color, group=VISUAL_GROUP)
         return body

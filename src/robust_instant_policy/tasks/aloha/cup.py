@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.aloha.surfaces import (
-    SOLID_GROUP,
     Body,
+    add_hull,
     add_surface,
     free_body,
     paint,
@@ -87,16 +87,7 @@ class Cup:
         corners = [
             np.column_stack([r * ring, np.full(FACETS, z)]) for r, z in ((self.foot, 0.0), (self.rim, self.height))
         ]
-        hull = spec.add_mesh(name=f"{name}-hull")
-        hull.uservert = np.concatenate(corners).astype(np.float32).ravel()
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"{name}-hull",
-            mass=MASS_KG,
-            condim=6,
-            friction=[FRICTION, 5e-3, 2e-4],
-            group=SOLID_GROUP,
-        )
+        add_hull(spec, body, f"{name}-hull", np.concatenate(corners), mass=MASS_KG, friction=FRICTION)
         return body
 
     def _skin(self, outside: FloatArray) -> NDArray[np.uint8]:

@@ -10,9 +10,9 @@ from scipy.spatial import ConvexHull
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.aloha.surfaces import (
-    SOLID_GROUP,
     Body,
     Surface,
+    add_hull,
     add_surface,
     box_surface,
     free_body,
@@ -65,16 +65,7 @@ class Dust:
             image = (image[:1, :1] * rng.uniform(0.7, 1.0, (16, 16, 1))).astype(np.uint8)
         for index, surface in enumerate(looks):
             add_surface(spec, body, f"{name}-{index}", surface, image, shine=0.3)
-        hull = spec.add_mesh(name=f"{name}-hull")
-        hull.uservert = solid.astype(np.float32).ravel()
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"{name}-hull",
-            mass=MASS_KG,
-            condim=6,
-            friction=[FRICTION, 2e-3, 5e-4],
-            group=SOLID_GROUP,
-        )
+        add_hull(spec, body, f"{name}-hull", solid, mass=MASS_KG, friction=(FRICTION, 2e-3, 5e-4))
         return body
 
     def _shape(self, rng: np.random.Generator) -> tuple[list[Surface], FloatArray]:

@@ -12,7 +12,8 @@ from robust_instant_policy.tasks.aloha.cell import AlohaEnv
 from robust_instant_policy.tasks.aloha.surfaces import Surface, add_bar, add_surface, free_body
 from robust_instant_policy.tasks.banana import Banana
 from robust_instant_policy.tasks.demonstrator import Stroke
-from robust_instant_policy.tasks.poses import downward, facing
+from robust_instant_policy.tasks.picking import Pick, failure_of_pick
+from robust_instant_policy.tasks.poses import facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.22, 0.04), (-0.20, 0.20)
@@ -22,9 +23,7 @@ SKIN_FRICTION = 0.8
 
 LIFTED_M = 0.05
 
-GRASP_HEIGHT_M = 0.004  # of the fingertips over the table
-ABOVE_M = 0.10
-LIFT_M = 0.15
+PICK = Pick(above=0.10, grasp=0.004, lift=0.15, reach_speed=0.20, down_speed=0.08, lift_speed=0.10, error=0.004)
 
 
 class PickBananaEnv(AlohaEnv):
@@ -56,26 +55,13 @@ class PickBananaEnv(AlohaEnv):
 
 
 def pick(env: PickBananaEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Come down over the middle, fingers across the fruit, close, lift and hold."""
-    pose = env.middle()
-    x, y = pose[:2, 3].tolist()
-    yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
-    lift = LIFT_M + rng.uniform(-0.02, 0.02)
-    return [
-        Stroke(np.array([downward(x, y, ABOVE_M, yaw)]), closed=False, free=True, speed=0.20, error=0.004),
-        Stroke(np.array([downward(x, y, GRASP_HEIGHT_M, yaw)]), closed=True, speed=0.08, error=0.0015),
-        Stroke(np.array([downward(x, y, lift, yaw)]), closed=True, speed=0.10, error=0.004),
-    ]
+    """Across the middle of the fruit."""
+    return PICK.strokes(env.middle(), rng)
 
 
 def verdict(env: PickBananaEnv) -> str:
     """Why the task failed, or nothing."""
-    state = env.evaluate()
-    if state["success"]:
-        return ""
-    if not state["held"]:
-        return "the banana slipped out of the fingers" if state["lifted"] else "the fingers hold no banana"
-    return "the banana is held but still moving" if state["lifted"] else "the banana was not lifted"
+    return failure_of_pick(env.evaluate(), "banana")
 
 
 SPEC = TaskSpec(

@@ -164,6 +164,17 @@ def add_solid(
     )
 
 
+def add_hull(
+    spec: mujoco.MjSpec, body: Body, name: str, points: ArrayLike, *, friction: ArrayLike = 0.6, **more: Any
+) -> Any:
+    """Something to touch: the hull of ``points (N, 3)``; ``friction`` is sliding alone, or all three of MuJoCo's."""
+    spec.add_mesh(name=name).uservert = np.asarray(points, dtype=np.float32).ravel()
+    frictions = np.array([0.0, TORSION_M, ROLLING_M])
+    frictions[: np.size(friction)] = friction
+    options = {"condim": 6, "group": SOLID_GROUP} | more
+    return body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, friction=frictions, **options)
+
+
 def add_bar(body: Body, start: ArrayLike, stop: ArrayLike, radius: float, **more: Any) -> Any:
     """A capsule from ``start (3,)`` to ``stop (3,)``."""
     start, stop = np.asarray(start, dtype=np.float64), np.asarray(stop, dtype=np.float64)

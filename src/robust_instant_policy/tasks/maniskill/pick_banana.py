@@ -21,7 +21,8 @@ from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill import partnet
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.paint import texture
-from robust_instant_policy.tasks.poses import downward, facing
+from robust_instant_policy.tasks.picking import Pick, failure_of_pick
+from robust_instant_policy.tasks.poses import facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.08, 0.16), (-0.15, 0.15)
@@ -31,9 +32,7 @@ SKIN_FRICTION = 0.8
 
 LIFTED_M = 0.05
 
-GRASP_HEIGHT_M = 0.007  # of the fingertips over the table
-ABOVE_M = 0.12
-LIFT_M = 0.16
+PICK = Pick(above=0.12, grasp=0.007, lift=0.16, reach_speed=0.35, down_speed=0.14, lift_speed=0.16, error=0.005)
 
 _skin = lru_cache(maxsize=4)(Banana.skin)  # a scene is built anew for each execution in it
 
@@ -95,26 +94,13 @@ def _build(shape: Banana, scene: Any) -> Actor:
 
 
 def pick(env: PickBananaEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Come down over the middle, fingers across the fruit, close, lift and hold."""
-    pose = env.middle()
-    x, y = pose[:2, 3].tolist()
-    yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
-    lift = LIFT_M + rng.uniform(-0.02, 0.02)
-    return [
-        Stroke(np.array([downward(x, y, ABOVE_M, yaw)]), closed=False, free=True, speed=0.35, error=0.005),
-        Stroke(np.array([downward(x, y, GRASP_HEIGHT_M, yaw)]), closed=True, speed=0.14, error=0.0015),
-        Stroke(np.array([downward(x, y, lift, yaw)]), closed=True, speed=0.16, error=0.005),
-    ]
+    """Across the middle of the fruit."""
+    return PICK.strokes(env.middle(), rng)
 
 
 def verdict(env: PickBananaEnv) -> str:
     """Why the task failed, or nothing."""
-    state: dict[str, Any] = env.evaluate()
-    if bool(state["success"]):
-        return ""
-    if not bool(state["held"]):
-        return "the banana slipped out of the fingers" if bool(state["lifted"]) else "the fingers hold no banana"
-    return "the banana is held but still moving" if bool(state["lifted"]) else "the banana was not lifted"
+    return failure_of_pick(env.evaluate(), "banana")
 
 
 SPEC = TaskSpec(
