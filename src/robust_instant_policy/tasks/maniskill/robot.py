@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import sapien
 import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
 from mani_skill.agents.controllers import PDJointPosControllerConfig, PDJointPosMimicControllerConfig, deepcopy_dict
 from mani_skill.agents.registration import register_agent
 from mani_skill.utils import sapien_utils
+from mani_skill.utils.building.articulation_builder import ArticulationBuilder
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.link import Link
 
@@ -58,6 +60,7 @@ class UR5eHandE(BaseAgent):
         ),
     )
     disable_self_collisions = True
+    _description: ClassVar[ArticulationBuilder | None] = None
     keyframes: ClassVar[dict] = dict(
         rest=Keyframe(
             pose=None,
@@ -94,6 +97,23 @@ class UR5eHandE(BaseAgent):
                 ),
             )
         )
+
+    def _load_articulation(self, initial_pose: sapien.Pose | None = None) -> None:
+        # As the base class does, but the description is read once in a process, not once for each scene.
+        builder = UR5eHandE._description = UR5eHandE._description or self._described()
+        builder.set_scene(self.scene)
+        builder.set_scene_idxs(None)
+        builder.initial_pose = initial_pose
+        self.robot = builder.build()
+        self.robot_link_names = [link.name for link in self.robot.get_links()]
+
+    def _described(self) -> ArticulationBuilder:
+        """What the URDF file says, ready to be built in any scene."""
+        loader = self.scene.create_urdf_loader()
+        loader.name, loader.disable_self_collisions = self.uid, self.disable_self_collisions
+        sapien_utils.apply_urdf_config(loader, sapien_utils.parse_urdf_config(self.urdf_config))
+        (builder,) = loader.parse(self.urdf_path)["articulation_builders"]
+        return builder
 
     def _after_init(self) -> None:
         links = self.robot.get_links()
