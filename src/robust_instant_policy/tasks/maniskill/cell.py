@@ -102,7 +102,10 @@ class CellEnv(BaseEnv):
 
         `step` evaluates the task, too, which for an object in the hand takes longer than the physics.
         """
-        self._step_action(command)
+        self.agent.drive(command)
+        self._before_control_step()
+        for _ in range(self._sim_steps_per_control):
+            self.scene.step()
         self._elapsed_steps += 1
 
     def _before_control_step(self) -> None:

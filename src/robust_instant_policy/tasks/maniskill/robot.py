@@ -20,7 +20,8 @@ from mani_skill.utils.building.articulation_builder import ArticulationBuilder
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.link import Link
 
-from robust_instant_policy.geometry import GripperTriangle
+from robust_instant_policy.errors import InvalidValueError
+from robust_instant_policy.geometry import FloatArray, GripperTriangle
 
 URDF_PATH = Path(__file__).with_name("ur5e_hande.urdf")
 
@@ -120,6 +121,18 @@ class UR5eHandE(BaseAgent):
         self.left_finger: Link = sapien_utils.get_obj_by_name(links, "left_finger_link")
         self.right_finger: Link = sapien_utils.get_obj_by_name(links, "right_finger_link")
         self.tcp: Link = sapien_utils.get_obj_by_name(links, TOOL_LINK)
+        joints = self.robot.active_joints_map
+        self._drives = [joints[name]._objs[0] for name in (*ARM_JOINTS, *FINGER_JOINTS)]
+
+    def drive(self, command: FloatArray) -> None:
+        """Command joint angles and finger travel ``(7,)``, as the control mode ``pd_joint_pos`` does in one scene.
+
+        A controller's own way there takes longer than the physics.
+        """
+        if not np.isfinite(command).all():
+            raise InvalidValueError(f"joints cannot be commanded to {command}")
+        for drive, target in zip(self._drives, (*command, command[-1]), strict=True):
+            drive.set_drive_target(target)
 
     def is_grasping(self, object: Actor | Link, min_force: float = 0.5, max_angle: float = 85.0) -> torch.Tensor:
         """Whether both fingers press on ``object`` with ``min_force`` N or more, about along the closing direction."""
