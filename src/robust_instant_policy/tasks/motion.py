@@ -249,7 +249,7 @@ def _refuse_meeting(poses: FloatArray, arms: Sequence[Arm], steps: np.ndarray) -
     ]
     for one, other in combinations(range(len(arms)), 2):
         apart = np.linalg.norm(lines[one][:, :, None] - lines[other][:, None], axis=-1).min(axis=(1, 2))
-        what = f"a place {{:.0f}} mm from {arms[other].name}'s"
+        what = f"a place {{:.0f}} mm from the {arms[other].name} one"
         _refuse((apart < HANDS_APART_M)[:, None], what, 1e3 * apart[:, None], arms[one : one + 1], steps)
 
 

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import gymnasium
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, make_pose
@@ -57,13 +58,15 @@ WORKSPACE = np.array([[-0.30, -0.32, -0.005], [0.22, 0.32, 0.4]])
 class AlohaEnv(gymnasium.Env):
     """Base of the five environments; a subclass adds its objects and says when they are where they should be.
 
-    ``end_effectors`` are the arms that work; others stay parked. Actions are, of one after the other, the six joint
-    angles (rad) and the travel of each finger (m, 0 closed), at `CONTROL_HZ`. Observations are the same numbers as
-    reached, ``joints``, and with ``obs_mode="rgbd"`` the camera's ``rgb`` and ``depth`` (metres). The reward is 1
-    where the task is done. ``objects`` as in `tasks.make_task`.
+    ``end_effectors`` are the arms that work; others stay parked. ``beside`` is where the camera for videos stands and
+    what it looks at. Actions are, of one arm after the other, the six joint angles (rad) and the travel of each finger
+    (m, 0 closed), at `CONTROL_HZ`. Observations are the same numbers as reached, ``joints``, and with
+    ``obs_mode="rgbd"`` the camera's ``rgb`` and ``depth`` (metres). The reward is 1 where the task is done.
+    ``objects`` as in `tasks.make_task`.
     """
 
     end_effectors: ClassVar[tuple[str, ...]] = ("left",)
+    beside: ClassVar[tuple[tuple[float, float, float], ...]] = ((-0.10, -0.80, 0.50), (-0.18, 0.0, 0.12))
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": int(CONTROL_HZ)}
 
     def __init__(self, objects: str = "seen", obs_mode: str = "rgbd", render_mode: str | None = None):
@@ -102,6 +105,7 @@ class AlohaEnv(gymnasium.Env):
         self._close_renderers()
         spec = two_arms()
         _furnish(spec)
+        add_side_camera(spec.worldbody, *self.beside)
         self.build(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
@@ -285,13 +289,12 @@ def _furnish(spec: mujoco.MjSpec) -> None:
         )
     camera = world.add_camera(name="top", pos=[CAMERA_X_M, 0, CAMERA_HEIGHT_M], fovy=CAMERA_FOV_DEG)
     camera.quat = [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)]
-    add_side_camera(world)
 
 
-def add_side_camera(world: Any) -> None:
-    """A camera that looks at the table's middle from beside it."""
-    eye, target = np.array([-0.10, -0.80, 0.50]), np.array([-0.18, 0.0, 0.12])
-    back = (eye - target) / np.linalg.norm(eye - target)
+def add_side_camera(world: Any, eye: ArrayLike, target: ArrayLike) -> None:
+    """A camera at ``eye (3,)`` that looks at ``target (3,)``, upright."""
+    back = np.subtract(eye, target)
+    back /= np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     quaternion = np.zeros(4)
