@@ -99,7 +99,7 @@ def test_trajectories_of_different_length_keep_their_lengths_in_the_papers_promp
 
 def test_each_part_of_the_task_is_written_in_the_frame_of_its_object():
     keypoints, trajectories = demonstrations()
-    frames = InContextPrompt().fit(keypoints, trajectories).frames_
+    frames = InContextPrompt().fit(keypoints, trajectories).frames_[0]
     assert frames[0].kind == "world"
     assert set(frames[11].members) <= set(range(5))  # the grasp
     assert set(frames[23].members) <= set(range(5, 10))  # the place
@@ -114,6 +114,21 @@ def test_the_trajectory_follows_objects_that_were_moved_and_turned():
         planned = prompt.median_trajectory(new)
         for step in (0, 11, 23):
             assert np.linalg.norm(planned.triplets[step] - truth.triplets[step], axis=-1).max() < 0.008
+
+
+def test_each_arm_follows_the_object_that_it_is_at():
+    keypoints, trajectories = demonstrations()
+    prompt = InContextPrompt().fit(keypoints, [there_and_back(trajectory) for trajectory in trajectories])
+    for seed in range(100, 105):
+        new, truth = scene(seed)
+        planned, wanted = prompt.median_trajectory(new), there_and_back(truth)
+        for step in (0, 23):  # one arm is at home, the other at the second object
+            assert np.linalg.norm(planned.triplets[step] - wanted.triplets[step], axis=-1).max() < 0.008
+
+
+def there_and_back(trajectory: Trajectory) -> Trajectory:
+    """Two arms, of which the second does backwards what the first does."""
+    return Trajectory.from_actions(np.concatenate([trajectory.actions, trajectory.actions[::-1]], axis=1))
 
 
 def test_one_demonstration_is_enough_to_follow_an_object():
@@ -151,7 +166,7 @@ def test_moving_the_whole_scene_moves_the_plan_with_it_except_where_the_world_co
     turn, shift = turned(0.5), np.array([0.05, 0.1, 0.02])
     before = prompt.median_trajectory(new).triplets
     after = prompt.median_trajectory(new @ turn.T + shift).triplets
-    for step, frame in enumerate(prompt.frames_):
+    for step, frame in enumerate(prompt.frames_[0]):
         expected = before[step] if frame.kind == "world" else before[step] @ turn.T + shift
         assert np.allclose(after[step], expected, atol=1e-6)
 

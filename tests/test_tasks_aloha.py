@@ -12,6 +12,7 @@ import pytest
 from robust_instant_policy.errors import UnreachableError
 from robust_instant_policy.geometry import invert_pose, lift
 from robust_instant_policy.tasks import make_task
+from robust_instant_policy.tasks.motion import Motion
 from robust_instant_policy.trajectory import Trajectory, downsample
 
 SEED = 1
@@ -84,8 +85,8 @@ def test_objects_at_rest_stay_at_rest_for_a_minute(task):
 
 
 def stay(task, seconds: float, command: np.ndarray | None = None) -> None:
-    """Let time pass with the arm at home, or where ``command`` says."""
-    command = np.append(task._arm.home, task._arm.finger_travel) if command is None else command
+    """Let time pass with the arms at home, or where ``command`` says."""
+    command = Motion.at_home(task._arms).commands[0] if command is None else command
     for _ in range(int(seconds * task._timing.control_hz)):
         task._cell.advance(command)
 
@@ -95,11 +96,11 @@ def test_what_was_grasped_does_not_slip(banana):
     cell = banana._cell
     command = cell._joints()
     command[-1] = 0.0
-    held = invert_pose(cell.tool_pose()) @ cell.middle()
+    held = invert_pose(cell.tool_poses()[0]) @ cell.middle()
     stay(banana, HOLD_SECONDS, command)
     assert attempt.success
     assert cell.evaluate()["success"]
-    np.testing.assert_allclose(invert_pose(cell.tool_pose()) @ cell.middle(), held, atol=SLIP_M)
+    np.testing.assert_allclose(invert_pose(cell.tool_poses()[0]) @ cell.middle(), held, atol=SLIP_M)
 
 
 @pytest.mark.parametrize("name", ["aloha-sweep", "aloha-pick-place"])
@@ -153,9 +154,9 @@ def test_an_unreachable_step_is_named_before_anything_moves(banana, offset, word
     np.testing.assert_array_equal(banana.scene_truth().poses, before)
 
 
-def test_simulator_and_kinematics_agree_on_the_tool(banana):
-    banana.reset(SEED)
-    np.testing.assert_allclose(banana._cell.tool_pose(), banana._arm.home_pose, atol=2e-3)
+def test_simulator_and_kinematics_agree_on_the_tools(task):
+    task.reset(SEED)
+    np.testing.assert_allclose(task._cell.tool_poses(), [arm.home_pose for arm in task._arms], atol=2e-3)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

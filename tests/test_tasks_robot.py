@@ -78,6 +78,6 @@ def test_simulator_and_kinematics_agree_on_the_tool():
     try:
         env.reset(seed=0)
         at_home = ur5e_kinematics(BASE_POSITION_M).tool_pose(HOME_JOINTS)
-        np.testing.assert_allclose(env.unwrapped.tool_pose(), at_home, atol=1e-5)
+        np.testing.assert_allclose(env.unwrapped.tool_poses()[0], at_home, atol=1e-5)
     finally:
         env.close()

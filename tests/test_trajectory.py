@@ -105,6 +105,14 @@ def test_two_arms_are_two_triplets():
     assert trajectory.gripper_state.tolist() == [[9, 19], [29, 39], [49, 59]]
 
 
+def test_the_poses_of_two_arms_stand_side_by_side():
+    poses = np.stack([make_pose(rotation(seed), [0.1 * seed, -0.2, 0.3]) for seed in range(6)]).reshape(3, 2, 4, 4)
+    states = np.array([[0, 0], [0, 1], [1, 1]])
+    both = Trajectory.from_poses(poses, states, TRIANGLE)
+    alone = [Trajectory.from_poses(poses[:, arm], states[:, arm], TRIANGLE) for arm in (0, 1)]
+    np.testing.assert_array_equal(both.actions, np.concatenate([one.actions for one in alone], axis=1))
+
+
 @pytest.mark.parametrize(
     ("actions", "times", "words"),
     [

@@ -53,10 +53,14 @@ class Trajectory:
 
     @classmethod
     def from_poses(cls, poses: ArrayLike, gripper_state: ArrayLike, triangle: GripperTriangle) -> Trajectory:
-        """Evenly timed one-arm trajectory from tool ``poses (T, 4, 4)`` and ``gripper_state (T,)``."""
+        """Evenly timed trajectory from tool ``poses (T, A, 4, 4)`` and ``gripper_state (T, A)`` of A arms.
+
+        The arms' axis may be left out where there is one arm: ``(T, 4, 4)`` and ``(T,)``.
+        """
         triplets = triangle.triplets(poses)
         state = np.asarray(gripper_state, dtype=np.float64)
-        return cls.from_actions(np.concatenate([triplets.reshape(len(triplets), 9), state[:, None]], axis=1))
+        actions = np.concatenate([triplets.reshape(*triplets.shape[:-2], STATE_INDEX), state[..., None]], axis=-1)
+        return cls.from_actions(actions.reshape(len(actions), ACTION_DIM * int(np.prod(actions.shape[1:-1]))))
 
     def __len__(self) -> int:
         return len(self.actions)

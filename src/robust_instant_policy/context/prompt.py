@@ -46,12 +46,13 @@ Order = Literal["given", "nearest-last"]
 
 @dataclass(frozen=True, eq=False)
 class _Question:
-    """What one query asks: the numbers ``asked`` (step, dimension) of neighbouring steps written in one frame.
+    """What one query asks: the numbers ``asked`` (step, dimension) of an arm's neighbouring steps written in one frame.
 
-    ``digits`` bounds the length of each, ``inputs`` are the keypoint coordinates shown with it (in the frame of
-    ``step``), and ``examples`` has a line for each demonstration.
+    ``digits`` bounds the length of each, ``inputs`` are the keypoint coordinates shown with it (in the frame of the
+    ``arm`` at ``step``), and ``examples`` has a line for each demonstration.
     """
 
+    arm: int
     step: int
     asked: tuple[tuple[int, int], ...]
     digits: tuple[int, ...]
@@ -62,14 +63,14 @@ class _Question:
 class InContextPrompt:
     """Writes prompts from demonstrations and reads the answers.
 
-    ``frames="world"`` writes every number in the world frame, ``"adaptive"`` each step in the frame in which the
-    demonstrations agree best. ``layout="sequence"`` puts whole trajectories into one prompt (with the world frame
-    this is Keypoint Action Tokens, Di Palo and Johns 2024); ``"factorised"`` asks for each step by itself.
+    ``frames="world"`` writes every number in the world frame, ``"adaptive"`` each step of each arm in the frame in
+    which the demonstrations agree best. ``layout="sequence"`` puts whole trajectories into one prompt (with the world
+    frame this is Keypoint Action Tokens, Di Palo and Johns 2024); ``"factorised"`` asks for each step by itself.
 
     ``order="nearest-last"`` puts the demonstrations whose keypoints lie nearest to the new scene's at the end, at
     the cost that a model cannot go on from what it read for the last scene, as it can with ``"given"``.
 
-    After `fit`, ``frames_`` lists the frame of each step.
+    After `fit`, ``frames_`` lists for each arm the frame of each step.
     """
 
     def __init__(self, frames: Frames = "adaptive", layout: Layout = "factorised", order: Order = "given"):
@@ -98,7 +99,7 @@ class InContextPrompt:
         if self.frames == "world" and self.layout == "sequence":
             # The paper's prompt: trajectories as they are, whatever their lengths.
             self._lengths = [len(trajectory) for trajectory in trajectories]
-            self.frames_: list[Frame] = [WORLD] * max(self._lengths)
+            self.frames_: list[list[Frame]] = [[WORLD] * max(self._lengths)] * self._num_arms
             self._keypoints = keypoints
             self._write_sequences([_world_rows(trajectory) for trajectory in trajectories])
             return self
@@ -114,8 +115,11 @@ class InContextPrompt:
             shown = np.stack([self._inputs(points) for points in self._keypoints])
             self._numbers = numbers
             self._centre = np.round(np.median(numbers, axis=0))
-            blocks = _neighbours(self.frames_, STEPS_PER_QUERY)
-            questions = (_ask(steps, numbers - self._centre, shown) for steps in blocks)
+            questions = (
+                _ask(arm, steps, numbers - self._centre, shown)
+                for arm, frames in enumerate(self.frames_)
+                for steps in _neighbours(frames, STEPS_PER_QUERY)
+            )
             self._questions = [question for question in questions if question.asked]
         return self
 
@@ -139,14 +143,14 @@ class InContextPrompt:
         inputs = self._inputs(keypoints)
         return [
             Query(
-                "".join(question.examples[demo] for demo in order) + _shown(inputs[question.step], question.inputs),
-                max_tokens=sum(question.digits) + 2 * len(question.digits) + 1,
-                grammar=row_grammar(question.digits),
-                pattern=row_pattern(question.digits),
+                "".join(asked.examples[demo] for demo in order) + _shown(inputs[asked.step, asked.arm], asked.inputs),
+                max_tokens=sum(asked.digits) + 2 * len(asked.digits) + 1,
+                grammar=row_grammar(asked.digits),
+                pattern=row_pattern(asked.digits),
                 stop=("\n",),
                 instruction=INSTRUCTION,
             )
-            for question in self._questions
+            for asked in self._questions
         ]
 
     def accepts(self, query_index: int, text: str) -> bool:
@@ -234,28 +238,29 @@ class InContextPrompt:
     def _choose_frames(self, actions: FloatArray, key_steps: Sequence[int]) -> None:
         steps = actions.shape[1]
         if self.frames == "world":
-            self.frames_ = [WORLD] * steps
+            self.frames_ = [[WORLD] * steps] * self._num_arms
             return
         candidates = candidate_frames(self._keypoints)
         poses = np.stack([np.stack([frame.pose(points) for points in self._keypoints]) for frame in candidates])
-        triplets = actions.reshape(len(actions), steps, -1, ACTION_DIM)[..., :STATE_INDEX]
-        chosen = choose_frames(candidates, poses, triplets.reshape(len(actions), steps, -1, 3), key_steps)
-        self.frames_ = [candidates[index] for index in chosen]
+        rows = actions.reshape(len(actions), steps, self._num_arms, ACTION_DIM)[..., :STATE_INDEX]
+        triplets = rows.reshape(*rows.shape[:-1], 3, 3)
+        self.frames_ = [
+            [candidates[index] for index in choose_frames(candidates, poses, triplets[:, :, arm], key_steps)]
+            for arm in range(self._num_arms)
+        ]
 
     def _poses(self, keypoints: FloatArray) -> FloatArray:
-        """Pose of each step's frame ``(T, 4, 4)``."""
-        known: dict[int, FloatArray] = {}
-        for frame in self.frames_:
-            if id(frame) not in known:
-                known[id(frame)] = frame.pose(keypoints)
-        return np.stack([known[id(frame)] for frame in self.frames_])
+        """Pose of the frame of each step and arm ``(T, A, 4, 4)``."""
+        known = {id(frame): frame for frames in self.frames_ for frame in frames}
+        poses = {key: frame.pose(keypoints) for key, frame in known.items()}
+        return np.stack([[poses[id(frame)] for frame in frames] for frames in zip(*self.frames_, strict=True)])
 
     def _encode(self, keypoints: FloatArray, actions: FloatArray) -> FloatArray:
         """Numbers ``(T, 10·A)``: in each step's frame, in millimetres, the point between the fingertips, then the palm
         and the first fingertip as seen from it; the gripper's state."""
         rows = actions.reshape(len(actions), self._num_arms, ACTION_DIM).copy()
-        for pose, row in zip(self._poses(keypoints), rows, strict=True):
-            for arm in row:
+        for poses, row in zip(self._poses(keypoints), rows, strict=True):
+            for pose, arm in zip(poses, row, strict=True):
                 palm, left, right = transform_points(invert_pose(pose), arm[:STATE_INDEX].reshape(3, 3))
                 centre = (left + right) / 2
                 arm[:STATE_INDEX] = MM * np.concatenate([centre, palm - centre, left - centre])
@@ -264,18 +269,18 @@ class InContextPrompt:
     def _decode(self, keypoints: FloatArray, numbers: FloatArray) -> FloatArray:
         """The inverse of `_encode` for the first ``len(numbers)`` steps."""
         rows = numbers.reshape(len(numbers), self._num_arms, ACTION_DIM).copy()
-        for pose, row in zip(self._poses(keypoints), rows, strict=False):
-            for arm in row:
+        for poses, row in zip(self._poses(keypoints), rows, strict=False):
+            for pose, arm in zip(poses, row, strict=True):
                 centre, palm, left = arm[:STATE_INDEX].reshape(3, 3) / MM
                 points = np.stack([centre + palm, centre + left, centre - left])
                 arm[:STATE_INDEX] = transform_points(pose, points).ravel()
         return rows.reshape(len(numbers), -1)
 
     def _inputs(self, keypoints: FloatArray) -> FloatArray:
-        """The keypoints in each step's frame, in millimetres ``(T, 3·K)``."""
-        return np.stack(
-            [MM * transform_points(invert_pose(pose), keypoints).ravel() for pose in self._poses(keypoints)]
-        )
+        """The keypoints in the frame of each step and arm, in millimetres ``(T, A, 3·K)``."""
+        poses = self._poses(keypoints)
+        shown = [MM * transform_points(invert_pose(pose), keypoints).ravel() for pose in poses.reshape(-1, 4, 4)]
+        return np.reshape(shown, (*poses.shape[:2], -1))
 
     def _checked(self, keypoints: FloatArray) -> FloatArray:
         keypoints = np.asarray(keypoints, dtype=np.float64)
@@ -294,9 +299,9 @@ def _neighbours(frames: Sequence[Frame], most: int) -> list[tuple[int, ...]]:
     return blocks
 
 
-def _ask(steps: Sequence[int], offsets: FloatArray, shown: FloatArray) -> _Question:
-    """The question about ``steps``, from the demonstrations' ``offsets (I, T, 10·A)`` from their median and the
-    ``shown (I, T, 3·K)`` keypoints, all in millimetres."""
+def _ask(arm: int, steps: Sequence[int], offsets: FloatArray, shown: FloatArray) -> _Question:
+    """The question about ``steps`` of ``arm``, from the demonstrations' ``offsets (I, T, 10·A)`` from their median and
+    the ``shown (I, T, A, 3·K)`` keypoints, all in millimetres."""
     whole = np.round(offsets).astype(int)
     reach = np.abs(whole).max(axis=0)
     is_state = np.arange(offsets.shape[2]) % ACTION_DIM == STATE_INDEX
@@ -304,16 +309,16 @@ def _ask(steps: Sequence[int], offsets: FloatArray, shown: FloatArray) -> _Quest
         varies = np.where(is_state, reach > 0, np.abs(offsets).max(axis=0) > AGREE_MM)
     else:  # too few to tell what always stays the same
         varies = np.broadcast_to(~is_state, reach.shape)
-    asked = tuple((step, int(dim)) for step in steps for dim in np.flatnonzero(varies[step]))
+    own = range(ACTION_DIM * arm, ACTION_DIM * (arm + 1))
+    asked = tuple((step, dim) for step in steps for dim in own if varies[step, dim])
     if not asked:
-        return _Question(steps[0], (), (), (), ())
+        return _Question(arm, steps[0], (), (), (), ())
     rows = np.stack([whole[:, step, dim] for step, dim in asked], axis=1)
     digits = tuple(max(1, len(str(round(1.5 * reach[step, dim])))) for step, dim in asked)
-    inputs = _telling_inputs(shown[:, steps[0]], rows)
-    examples = tuple(
-        _shown(points, inputs) + write_row(row) + "\n" for points, row in zip(shown[:, steps[0]], rows, strict=True)
-    )
-    return _Question(steps[0], asked, digits, inputs, examples)
+    seen = shown[:, steps[0], arm]
+    inputs = _telling_inputs(seen, rows)
+    examples = tuple(_shown(points, inputs) + write_row(row) + "\n" for points, row in zip(seen, rows, strict=True))
+    return _Question(arm, steps[0], asked, digits, inputs, examples)
 
 
 def _telling_inputs(shown: FloatArray, outputs: FloatArray) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""A person's hand on a leader arm: strokes with their own path, speed, pauses and small errors.
+"""A person's hands on leader arms: strokes with their own path, speed, pauses and small errors.
 
 An expert says what to do as `Stroke`s; `perform` says how this person does it this time. Strokes between rests
 follow the minimum-jerk profile of human reaching (Flash and Hogan 1985).
@@ -35,7 +35,9 @@ class Stroke:
 
     ``error`` is the spread, in metres, with which the person hits the last position; ``speed`` the usual mean
     speed in m/s; ``pause`` the usual rest afterwards in seconds; ``closed`` the gripper state from then on.
-    A ``free`` stroke touches nothing and may bow out on its way.
+    A ``free`` stroke touches nothing and may bow out on its way. ``hand`` is the one that makes the stroke, by its
+    place among the task's end-effectors; hands move at the same time, but a stroke that ``waits`` begins only when
+    all strokes named before it are done.
     """
 
     poses: FloatArray
@@ -44,31 +46,60 @@ class Stroke:
     error: float = 0.002
     pause: float = 0.08
     free: bool = False
+    hand: int = 0
+    waits: bool = False
 
 
 def perform(
-    start: FloatArray, strokes: Sequence[Stroke], rng: np.random.Generator, rate_hz: float
+    starts: FloatArray, strokes: Sequence[Stroke], rng: np.random.Generator, rate_hz: float
 ) -> tuple[FloatArray, np.ndarray]:
-    """Tool poses ``(T, 4, 4)`` and gripper command ``(T,)`` bool at ``rate_hz``, from ``start`` with an open hand."""
+    """Tool poses ``(T, A, 4, 4)`` and gripper commands ``(T, A)`` bool at ``rate_hz``, from ``starts (A, 4, 4)`` with
+    open hands."""
     pace = np.exp(rng.normal(0.0, SPEED_SPREAD))
-    poses, closed = [start[None]], [np.zeros(1, dtype=bool)]
-    here, shut = start, False
+    hands = [_Hand(start) for start in starts]
     for stroke in strokes:
-        path = _move(here, stroke, pace, rng, rate_hz)
+        hand = hands[stroke.hand]
+        if stroke.waits:
+            hand.rest_until(max(len(other) for other in hands))
+        path = _move(hand.pose, stroke, pace, rng, rate_hz)
         rest = stroke.pause * rng.uniform(0.3, 1.7)
         if rng.random() < HESITATION_CHANCE:
             rest += rng.uniform(*HESITATION_S)
-        poses.append(path)
-        closed.append(np.full(len(path), shut))
-        if stroke.closed != shut:
-            shut = stroke.closed
+        hand.follow(path)
+        if stroke.closed != hand.shut:
+            hand.shut = stroke.closed
             rest += rng.uniform(*GRIP_PAUSE_S)
-        here = path[-1]
-        poses.append(np.repeat(here[None], round(rest * rate_hz), axis=0))
-        closed.append(np.full(len(poses[-1]), shut))
-    whole = np.concatenate(poses)
-    whole[:, :3, 3] += _tremor(len(whole), rng, rate_hz)
-    return whole, np.concatenate(closed)
+        hand.rest_until(len(hand) + round(rest * rate_hz))
+    for hand in hands:
+        hand.rest_until(max(len(other) for other in hands))
+    whole = np.stack([hand.poses for hand in hands], axis=1)
+    for arm in range(len(hands)):
+        whole[:, arm, :3, 3] += _tremor(len(whole), rng, rate_hz)
+    return whole, np.stack([hand.closed for hand in hands], axis=1)
+
+
+class _Hand:
+    """What one hand has done so far: ``poses (T, 4, 4)``, each with the gripper command ``closed (T,)`` bool of then.
+
+    ``shut`` is the command from now on.
+    """
+
+    def __init__(self, start: FloatArray):
+        self.poses, self.closed, self.shut = start[None], np.zeros(1, dtype=bool), False
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @property
+    def pose(self) -> FloatArray:
+        return self.poses[-1]
+
+    def follow(self, path: FloatArray) -> None:
+        self.poses = np.concatenate([self.poses, path])
+        self.closed = np.append(self.closed, np.full(len(path), self.shut))
+
+    def rest_until(self, length: int) -> None:
+        self.follow(np.repeat(self.pose[None], length - len(self), axis=0))
 
 
 def _move(here: FloatArray, stroke: Stroke, pace: float, rng: np.random.Generator, rate_hz: float) -> FloatArray:

@@ -46,17 +46,17 @@ class TaskSpec:
 
 
 class Cell(Protocol):
-    """A gymnasium environment that holds a scene with an arm; see the methods of the same names in `Task`.
+    """A gymnasium environment that holds a scene with A arms; see the methods of the same names in `Task`.
 
-    ``advance`` takes one control step towards ``command``, joint angles and finger travel ``(J + 1,)``, rad and m.
-    ``tool_pose`` is where the arm's tool frame is, ``(4, 4)``.
+    ``advance`` takes one control step towards ``command (A·(J + 1),)``: of one arm after the other the joint angles
+    and the finger travel, rad and m. ``tool_poses`` is where the arms' tool frames are, ``(A, 4, 4)``.
     """
 
     def reset(self, *, seed: int) -> Any: ...
     def photograph(self) -> Observation: ...
     def scene_truth(self) -> SceneTruth: ...
     def advance(self, command: FloatArray) -> None: ...
-    def tool_pose(self) -> FloatArray: ...
+    def tool_poses(self) -> FloatArray: ...
     def video_frame(self) -> np.ndarray: ...
     def close(self) -> None: ...
 
@@ -75,16 +75,20 @@ class Timing:
 
 
 class SimulatedTask:
-    """See `tasks.task.Task`. One scene at a time, built anew from its seed before every execution."""
+    """See `tasks.task.Task`. One scene at a time, built anew from its seed before every execution.
 
-    def __init__(self, spec: TaskSpec, cell: Cell, arm: Arm, timing: Timing, workspace: FloatArray):
+    ``arms`` are those that work, all with the same gripper, in the order in which ``cell`` takes their commands.
+    """
+
+    def __init__(self, spec: TaskSpec, cell: Cell, arms: Sequence[Arm], timing: Timing, workspace: FloatArray):
         self.name, self.description, self.goal = spec.name, spec.description, spec.goal
-        self.end_effectors = (arm.name,)
+        self.end_effectors = tuple(arm.name for arm in arms)
         self.record_hz = timing.control_hz / timing.record_every
         self.execute_hz = timing.execute_hz
         self.video_hz = timing.control_hz / timing.frame_every
         self.workspace = workspace
-        self._spec, self._cell, self._arm, self._timing = spec, cell, arm, timing
+        self._spec, self._cell, self._arms, self._timing = spec, cell, arms, timing
+        self._triangle = arms[0].triangle
         self._seed: int | None = None
         self._fresh = False  # nothing has moved since the scene was built
 
@@ -98,7 +102,7 @@ class SimulatedTask:
         if not self._fresh:
             self._rebuild(self._seed)
         control_hz = self._timing.control_hz
-        motion = plan_waypoints(trajectory, self._arm, self.execute_hz, control_hz)
+        motion = plan_waypoints(trajectory, self._arms, self.execute_hz, control_hz)
         tracking_error = self._play(motion, self._filming(on_frame))
         failure = self._spec.verdict(self._cell)
         return Execution(not failure, failure, len(motion.joints) / control_hz, tracking_error)
@@ -110,14 +114,14 @@ class SimulatedTask:
             self._rebuild(self._seed)
         control_hz = self._timing.control_hz
         before_step = self._filming(on_frame)
-        motion = Motion.at_home(self._arm)
+        motion = Motion.at_home(self._arms)
         steps, worst, failure = 0, 0.0, ""
         while steps < max_seconds * control_hz and not failure:
-            waypoints = controller.act(self._cell.photograph().rgb, self._action(bool(motion.closed[-1])))
+            waypoints = controller.act(self._cell.photograph().rgb, self._action(motion.closed[-1]))
             if waypoints is None:
                 break
             try:
-                motion = plan_onward(waypoints, controller.rate_hz, motion, self._arm, control_hz)
+                motion = plan_onward(waypoints, controller.rate_hz, motion, self._arms, control_hz)
             except UnreachableError as error:
                 failure = f"refused after {steps / control_hz:.1f} s: {error}"
             else:
@@ -131,10 +135,11 @@ class SimulatedTask:
         observation = self.reset(seed)
         rng = np.random.default_rng([seed, HAND_STREAM])
         strokes = self._spec.expert(self._cell, rng)
-        poses, closed = perform(self._arm.home_pose, strokes, rng, self._timing.control_hz)
+        home = np.stack([arm.home_pose for arm in self._arms])
+        poses, closed = perform(home, strokes, rng, self._timing.control_hz)
         images: list[Image] = []
         try:
-            motion = plan_poses(poses, closed, self._arm, self._timing.control_hz)
+            motion = plan_poses(poses, closed, self._arms, self._timing.control_hz)
         except UnreachableError as error:
             failure = str(error)
         else:
@@ -143,7 +148,7 @@ class SimulatedTask:
             self._rest(motion)
             failure = self._spec.verdict(self._cell)
         recorded = self._recorded(poses, every)
-        trajectory = Trajectory.from_poses(poses[recorded], closed[recorded].astype(np.float64), self._arm.triangle)
+        trajectory = Trajectory.from_poses(poses[recorded], closed[recorded], self._triangle)
         demonstration = Demonstration(observation, trajectory, self.record_hz / every, self.name, seed)
         return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
 
@@ -164,16 +169,16 @@ class SimulatedTask:
         return range((len(poses) - 1) % interval, len(poses), interval)
 
     def _play(self, motion: Motion, before_step: Callable[[], None]) -> float:
-        """Run the commands; the largest distance between the palm commanded and reached, in metres."""
-        palm = np.array([0.0, 0.0, -self._arm.triangle.length])
+        """Run the commands; the largest distance between a palm commanded and reached, in metres."""
+        palm = np.array([0.0, 0.0, -self._triangle.length])
         self._fresh = False
         worst = 0.0
-        for joints, fingers, pose in zip(motion.joints, motion.fingers, motion.poses, strict=True):
+        for command, poses in zip(motion.commands, motion.poses, strict=True):
             before_step()
-            self._cell.advance(np.append(joints, fingers))
-            reached = self._cell.tool_pose()
-            missed = (pose[:3, :3] @ palm + pose[:3, 3]) - (reached[:3, :3] @ palm + reached[:3, 3])
-            worst = max(worst, float(np.linalg.norm(missed)))
+            self._cell.advance(command)
+            reached = self._cell.tool_poses()
+            missed = (poses[:, :3, :3] @ palm + poses[:, :3, 3]) - (reached[:, :3, :3] @ palm + reached[:, :3, 3])
+            worst = max(worst, float(np.linalg.norm(missed, axis=1).max()))
         return worst
 
     def _filming(self, on_frame: FrameSink | None) -> Callable[[], None]:
@@ -198,13 +203,13 @@ class SimulatedTask:
 
         return before_step
 
-    def _action(self, shut: bool) -> FloatArray:
-        """Where the gripper is, with the state ``shut`` that it was told to take, as an action ``(10,)``."""
-        return np.append(self._arm.triangle.triplets(self._cell.tool_pose()).ravel(), float(shut))
+    def _action(self, shut: np.ndarray) -> FloatArray:
+        """Where the grippers are, with the states ``shut (A,)`` they were told to take, as an action ``(10·A,)``."""
+        return Trajectory.from_poses(self._cell.tool_poses()[None], shut[None], self._triangle).actions[0]
 
     def _rest(self, motion: Motion) -> None:
         for _ in range(int(SETTLE_SECONDS * self._timing.control_hz)):
-            self._cell.advance(np.append(motion.joints[-1], motion.fingers[-1]))
+            self._cell.advance(motion.commands[-1])
 
 
 def _nothing() -> None:

@@ -16,7 +16,6 @@ from robust_instant_policy.tasks.aloha.surfaces import (
     add_solid,
     add_surface,
     box_surface,
-    fixed_body,
     free_body,
     moved,
     paint,
@@ -78,19 +77,28 @@ class Brush:
 
 @dataclass(frozen=True)
 class Dustpan:
-    """Lies on z = 0, its lip along y at x = 0, the pan behind it along x; lengths in metres. Held to the table."""
+    """Lies on z = 0, its lip along y at x = 0, the pan and its handle behind it along x; lengths in metres."""
 
     width: float = 0.19
     depth: float = 0.11
     wall: float = 0.030
     lip: float = 0.020
     floor: float = 0.003
+    handle_length: float = 0.09
 
+    MASS_KG: ClassVar[float] = 0.15
     THICKNESS_M: ClassVar[float] = 0.004
+    HANDLE_M: ClassVar[tuple[float, float]] = (0.026, 0.018)
+    HANDLE_HEIGHT_M: ClassVar[float] = 0.021  # of its middle
+
+    @property
+    def grip(self) -> FloatArray:
+        """Where one holds it, the handle's middle ``(3,)``."""
+        return np.array([self.depth + self.handle_length / 2, 0.0, self.HANDLE_HEIGHT_M])
 
     def build(self, spec: mujoco.MjSpec, name: str, pose: FloatArray) -> Body:
         """Add the dustpan to ``spec`` at ``pose (4, 4)``."""
-        body = fixed_body(spec, name, pose)
+        body = free_body(spec, name, pose)
         t, half = self.THICKNESS_M, self.width / 2
         inside, middle = self.depth - self.lip, (self.depth + self.lip) / 2
         boxes = (
@@ -98,13 +106,15 @@ class Dustpan:
             ("back", (t, self.width, self.wall), (self.depth, 0, self.wall / 2)),
             ("left", (inside, t, self.wall), (middle, half, self.wall / 2)),
             ("right", (inside, t, self.wall), (middle, -half, self.wall / 2)),
-            ("handle", (0.06, 0.03, 0.02), (self.depth + 0.03, 0, 0.02)),
+            ("handle", (self.handle_length, *self.HANDLE_M), self.grip),
         )
+        volume = sum(float(np.prod(size)) for _, size, _ in boxes)
         for part, size, place in boxes:
             shade = np.array(PAN_BLUE) * (1.25 if part == "floor" else 1.0)
             add_surface(spec, body, f"{name}-{part}", moved(box_surface(size), place), paint(shade), shine=0.3)
-            add_solid(body, BOX, np.array(size) / 2, position=place, friction=PAN_FRICTION)
+            mass = self.MASS_KG * float(np.prod(size)) / volume
+            add_solid(body, BOX, np.array(size) / 2, position=place, friction=PAN_FRICTION, mass=mass)
         corners = [(x, y, z) for y in (-half, half) for x, z in ((0, 0), (self.lip, 0), (self.lip, self.floor))]
         color = [*(1.25 * np.array(PAN_BLUE)), 1.0]
-        add_hull(spec, body, f"{name}-ramp", corners, friction=PAN_FRICTION, rgba=color, group=VISUAL_GROUP)
+        add_hull(spec, body, f"{name}-ramp", corners, friction=PAN_FRICTION, rgba=color, group=VISUAL_GROUP, mass=0.0)
         return body

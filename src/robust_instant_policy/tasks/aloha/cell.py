@@ -1,7 +1,7 @@
 """The cell of the ALOHA tasks: a table between two arms, a depth camera above it, and a camera for videos.
 
-The world's origin lies on the table, midway between the arms; x points from the left arm, which works, to the right
-arm, which stays parked; z is up. The image's top points along +x.
+The world's origin lies on the table, midway between the arms; x points from the left arm to the right one; z is up. The
+image's top points along +x.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from typing import Any, ClassVar
 import gymnasium
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.tasks.aloha.renderer import require_renderer
 from robust_instant_policy.tasks.aloha.robot import (
     ARM_JOINTS,
+    ARMS,
     CLOSED_M,
     FINGER_TRAVEL_M,
     FINGERS,
     HOME_JOINTS,
-    PARKED,
     PARKED_JOINTS,
     TOOL,
-    WORKING,
     site_pose,
     two_arms,
 )
@@ -58,11 +58,15 @@ WORKSPACE = np.array([[-0.30, -0.32, -0.005], [0.22, 0.32, 0.4]])
 class AlohaEnv(gymnasium.Env):
     """Base of the five environments; a subclass adds its objects and says when they are where they should be.
 
-    Actions are the working arm's six joint angles (rad) and the travel of each finger (m, 0 closed), at `CONTROL_HZ`.
-    Observations are the same seven numbers as reached, ``joints``, and with ``obs_mode="rgbd"`` the camera's ``rgb``
-    and ``depth`` (metres). The reward is 1 where the task is done. ``objects`` as in `tasks.make_task`.
+    ``end_effectors`` are the arms that work; others stay parked. ``beside`` is where the camera for videos stands and
+    what it looks at. Actions are, of one arm after the other, the six joint angles (rad) and the travel of each finger
+    (m, 0 closed), at `CONTROL_HZ`. Observations are the same numbers as reached, ``joints``, and with
+    ``obs_mode="rgbd"`` the camera's ``rgb`` and ``depth`` (metres). The reward is 1 where the task is done.
+    ``objects`` as in `tasks.make_task`.
     """
 
+    end_effectors: ClassVar[tuple[str, ...]] = ("left",)
+    beside: ClassVar[tuple[tuple[float, float, float], ...]] = ((-0.10, -0.80, 0.50), (-0.18, 0.0, 0.12))
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": int(CONTROL_HZ)}
 
     def __init__(self, objects: str = "seen", obs_mode: str = "rgbd", render_mode: str | None = None):
@@ -70,7 +74,8 @@ class AlohaEnv(gymnasium.Env):
         self.objects, self.obs_mode, self.render_mode = objects, obs_mode, render_mode
         travel = [0.0], [FINGER_TRAVEL_M]
         ranges = _joint_ranges()
-        low, high = (np.concatenate([ranges[:, i], travel[i]]).astype(np.float32) for i in (0, 1))
+        bounds = (np.concatenate([ranges[:, i], travel[i]]).astype(np.float32) for i in (0, 1))
+        low, high = (np.tile(bound, len(self.end_effectors)) for bound in bounds)
         self.action_space = gymnasium.spaces.Box(low, high)
         unbounded = gymnasium.spaces.Box(-np.inf, np.inf, (len(low),))
         seen: dict[str, gymnasium.Space] = {"joints": unbounded}
@@ -100,15 +105,18 @@ class AlohaEnv(gymnasium.Env):
         self._close_renderers()
         spec = two_arms()
         _furnish(spec)
+        add_side_camera(spec.worldbody, *self.beside)
         self.build(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        for arm, joints, travel in ((WORKING, HOME_JOINTS, FINGER_TRAVEL_M), (PARKED, PARKED_JOINTS, 0.0)):
+        for side, arm in ARMS.items():
+            works = side in self.end_effectors
+            joints, travel = (HOME_JOINTS, FINGER_TRAVEL_M) if works else (PARKED_JOINTS, 0.0)
             for joint, angle in zip(ARM_JOINTS, joints, strict=True):
                 self.data.joint(f"{arm}/{joint}").qpos = angle
                 self.data.actuator(f"{arm}/{joint}").ctrl = angle
-            for finger, side in zip(FINGERS, (1, -1), strict=True):
-                self.data.joint(f"{arm}/{finger}").qpos = side * (CLOSED_M + travel)
+            for finger, sign in zip(FINGERS, (1, -1), strict=True):
+                self.data.joint(f"{arm}/{finger}").qpos = sign * (CLOSED_M + travel)
             self.data.actuator(f"{arm}/{FINGERS[0]}").ctrl = CLOSED_M + travel
         mujoco.mj_step(self.model, self.data, round(SETTLE_SECONDS / TIMESTEP_S))
         mujoco.mj_forward(self.model, self.data)
@@ -121,11 +129,12 @@ class AlohaEnv(gymnasium.Env):
         return self._observation(), float(state["success"]), False, False, state
 
     def advance(self, command: FloatArray) -> None:
-        """One control step, with joint angles and finger travel ``(7,)`` commanded, judging nothing."""
+        """One control step, with joint angles and finger travel ``(7·A,)`` commanded, judging nothing."""
         self._joints_before = self._joints()
-        for joint, angle in zip(ARM_JOINTS, command, strict=False):
-            self.data.actuator(f"{WORKING}/{joint}").ctrl = angle
-        self.data.actuator(f"{WORKING}/{FINGERS[0]}").ctrl = CLOSED_M + command[-1]
+        for side, (*angles, travel) in zip(self.end_effectors, command.reshape(-1, len(ARM_JOINTS) + 1), strict=True):
+            for joint, angle in zip(ARM_JOINTS, angles, strict=True):
+                self.data.actuator(f"{ARMS[side]}/{joint}").ctrl = angle
+            self.data.actuator(f"{ARMS[side]}/{FINGERS[0]}").ctrl = CLOSED_M + travel
         mujoco.mj_step(self.model, self.data, round(1 / CONTROL_HZ / TIMESTEP_S))
 
     def photograph(self) -> Observation:
@@ -172,9 +181,9 @@ class AlohaEnv(gymnasium.Env):
     def close(self) -> None:
         self._close_renderers()
 
-    def tool_pose(self) -> FloatArray:
-        """Where the working arm's tool frame is, ``(4, 4)``."""
-        return site_pose(self.data, f"{WORKING}/{TOOL}")
+    def tool_poses(self) -> FloatArray:
+        """Where the working arms' tool frames are, ``(A, 4, 4)``."""
+        return np.stack([site_pose(self.data, f"{ARMS[side]}/{TOOL}") for side in self.end_effectors])
 
     def pose_of(self, body: str) -> FloatArray:
         """Where a body is, ``(4, 4)``."""
@@ -182,8 +191,8 @@ class AlohaEnv(gymnasium.Env):
         return make_pose(place.xmat.reshape(3, 3), place.xpos)
 
     def arm_is_still(self) -> bool:
-        """Whether no joint of the working arm moved faster than `STILL_RAD_S` over the last control step."""
-        moved = np.abs(self._joints() - self._joints_before)[: len(ARM_JOINTS)]
+        """Whether no joint of a working arm moved faster than `STILL_RAD_S` over the last control step."""
+        moved = np.abs(self._joints() - self._joints_before).reshape(-1, len(ARM_JOINTS) + 1)[:, : len(ARM_JOINTS)]
         return bool(moved.max() * CONTROL_HZ <= STILL_RAD_S)
 
     def is_still(self, body: str) -> bool:
@@ -200,13 +209,17 @@ class AlohaEnv(gymnasium.Env):
                 total += float(force[0])
         return total
 
-    def is_held(self, body: str) -> bool:
-        """Whether both fingers of the working arm press on a body."""
-        return all(self.touch(body, f"{WORKING}/{finger}_link") > HELD_N for finger in FINGERS)
+    def is_held(self, body: str, side: str = "left") -> bool:
+        """Whether both fingers of the arm on a ``side`` press on a body."""
+        return all(self.touch(body, f"{ARMS[side]}/{finger}_link") > HELD_N for finger in FINGERS)
 
     def _joints(self) -> FloatArray:
-        angles = [self.data.joint(f"{WORKING}/{joint}").qpos[0] for joint in ARM_JOINTS]
-        return np.array([*angles, self.data.joint(f"{WORKING}/{FINGERS[0]}").qpos[0] - CLOSED_M])
+        """Joint angles and finger travel of the working arms, as commands have them ``(7·A,)``."""
+        reached: list[float] = []
+        for side in self.end_effectors:
+            reached += [self.data.joint(f"{ARMS[side]}/{joint}").qpos[0] for joint in ARM_JOINTS]
+            reached.append(self.data.joint(f"{ARMS[side]}/{FINGERS[0]}").qpos[0] - CLOSED_M)
+        return np.array(reached)
 
     def _observation(self) -> dict[str, np.ndarray]:
         seen: dict[str, np.ndarray] = {"joints": self._joints().astype(np.float32)}
@@ -228,7 +241,7 @@ class AlohaEnv(gymnasium.Env):
 
 def _joint_ranges() -> FloatArray:
     model = two_arms().compile()
-    return np.array([model.joint(f"{WORKING}/{joint}").range for joint in ARM_JOINTS])
+    return np.array([model.joint(f"{ARMS['left']}/{joint}").range for joint in ARM_JOINTS])
 
 
 def _furnish(spec: mujoco.MjSpec) -> None:
@@ -276,13 +289,12 @@ def _furnish(spec: mujoco.MjSpec) -> None:
         )
     camera = world.add_camera(name="top", pos=[CAMERA_X_M, 0, CAMERA_HEIGHT_M], fovy=CAMERA_FOV_DEG)
     camera.quat = [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)]
-    add_side_camera(world)
 
 
-def add_side_camera(world: Any) -> None:
-    """A camera that looks at the table's middle from beside it."""
-    eye, target = np.array([-0.10, -0.80, 0.50]), np.array([-0.18, 0.0, 0.12])
-    back = (eye - target) / np.linalg.norm(eye - target)
+def add_side_camera(world: Any, eye: ArrayLike, target: ArrayLike) -> None:
+    """A camera at ``eye (3,)`` that looks at ``target (3,)``, upright."""
+    back = np.subtract(eye, target)
+    back /= np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     quaternion = np.zeros(4)

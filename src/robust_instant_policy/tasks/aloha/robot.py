@@ -19,8 +19,7 @@ from robust_instant_policy.tasks.motion import Arm
 
 MODEL_PATH = Path(gym_aloha.__file__).parent / "assets" / "bimanual_viperx_transfer_cube.xml"
 
-ARMS = ("vx300s_left", "vx300s_right")
-WORKING, PARKED = ARMS  # the arm that trajectories are for, and the one that stays where it is
+ARMS = {"left": "vx300s_left", "right": "vx300s_right"}  # as tasks and as the model call them
 BASE_X_M = 0.469  # of the bases, to the left and right of the world's origin (gym-aloha)
 
 ARM_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
@@ -63,10 +62,10 @@ def two_arms() -> mujoco.MjSpec:
         for thing in list(things):
             spec.delete(thing)
     for body in list(spec.worldbody.bodies):
-        if body.name not in ARMS:
+        if body.name not in ARMS.values():
             spec.delete(body)
     spec.compiler.inertiagrouprange = [0, 5]
-    for arm, side in zip(ARMS, (-1, 1), strict=True):
+    for arm, side in zip(ARMS.values(), (-1, 1), strict=True):
         spec.body(arm).pos = [side * BASE_X_M, 0.0, 0.0]
         _refit(spec, arm)
     return spec
@@ -85,12 +84,13 @@ def _refit(spec: mujoco.MjSpec, arm: str) -> None:
         if geom.name.startswith(arm):
             is_finger = "finger" in geom.name
             geom.rgba = GREY if is_finger else BLACK
-            geom.contype, geom.conaffinity = int(not is_finger and "base" not in geom.name), 0
+            solid = not is_finger and "base" not in geom.name
+            geom.contype, geom.conaffinity = _touches(arm) if solid else (0, 0)
     for finger, side in zip(FINGERS, (1, -1), strict=True):
         body = spec.body(f"{arm}/{finger}_link")
         inner = -side * CLOSED_M  # the pad's face, in the finger's own frame
-        _pad(body, (0.0585, inner + side * 0.0025, 0.0), (0.0265, 0.0025, 0.0055))
-        _pad(body, (0.0150, inner + side * 0.0050, 0.0), (0.0170, 0.0050, 0.0250))
+        _pad(body, (0.0585, inner + side * 0.0025, 0.0), (0.0265, 0.0025, 0.0055), _touches(arm))
+        _pad(body, (0.0150, inner + side * 0.0050, 0.0), (0.0170, 0.0050, 0.0250), _touches(arm))
 
     for joint, stiffness, torque in zip(ARM_JOINTS, STIFFNESS, SERVO_TORQUE_NM, strict=True):
         _servo(spec, f"{arm}/{joint}", stiffness, LAG_S * stiffness, torque, ARMATURE)
@@ -107,7 +107,15 @@ def _refit(spec: mujoco.MjSpec, arm: str) -> None:
             body.gravcomp = 1.0
 
 
-def _pad(finger, position: tuple[float, float, float], size: tuple[float, float, float]) -> None:
+def _touches(arm: str) -> tuple[int, int]:
+    """MuJoCo's contype and conaffinity of the parts of ``arm``: they touch objects and the other arm's parts."""
+    bits = {name: 2 << index for index, name in enumerate(ARMS.values())}
+    return 1 | bits[arm], sum(bits.values()) - bits[arm]
+
+
+def _pad(
+    finger, position: tuple[float, float, float], size: tuple[float, float, float], touches: tuple[int, int]
+) -> None:
     finger.add_geom(
         type=mujoco.mjtGeom.mjGEOM_BOX,
         pos=position,
@@ -117,8 +125,8 @@ def _pad(finger, position: tuple[float, float, float], size: tuple[float, float,
         condim=6,
         priority=1,
         friction=[PAD_FRICTION, PAD_TORSION_M, PAD_ROLLING_M],
-        contype=1,
-        conaffinity=0,
+        contype=touches[0],
+        conaffinity=touches[1],
     )
 
 
@@ -131,17 +139,19 @@ def _servo(spec: mujoco.MjSpec, name: str, stiffness: float, damping: float, for
     servo.forcerange = [-force, force]
 
 
-def working_arm() -> Arm:
-    """The arm that trajectories are for, as the executor sees it."""
+def viperx(side: str) -> Arm:
+    """The arm on the ``side`` "left" or "right", as the executor sees it."""
     spec = two_arms()
     for name in list(spec.actuators) + list(spec.equalities):
         spec.delete(name)
-    spec.delete(spec.body(PARKED))
+    for name, body in ARMS.items():
+        if name != side:
+            spec.delete(spec.body(body))
     kinematics = Kinematics(
-        spec.compile(), f"{WORKING}/{TOOL}", "site", len(ARM_JOINTS), np.eye(4), RELUCTANCE_M, ORIENTATION_COST_M
+        spec.compile(), f"{ARMS[side]}/{TOOL}", "site", len(ARM_JOINTS), np.eye(4), RELUCTANCE_M, ORIENTATION_COST_M
     )
     return Arm(
-        name="left",
+        name=side,
         kinematics=kinematics,
         home=np.array(HOME_JOINTS),
         triangle=TRIANGLE,

@@ -1,16 +1,18 @@
-"""Sweep something into a dustpan with a brush that touches the table."""
+"""Sweep something into a dustpan: one hand holds the pan, the other the brush."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
+from robust_instant_policy.geometry import FloatArray, invert_pose, make_pose, transform_points
 from robust_instant_policy.tasks.aloha.broom import Brush, Dustpan
 from robust_instant_policy.tasks.aloha.cell import CONTROL_HZ, AlohaEnv
 from robust_instant_policy.tasks.aloha.dust import Dust
+from robust_instant_policy.tasks.aloha.hands import grip, over
 from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.object_sets import draw_object
 from robust_instant_policy.tasks.poses import downward, facing
@@ -18,8 +20,8 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 BRUSH_X_RANGE_M, BRUSH_Y_RANGE_M = (-0.24, -0.20), (0.17, 0.21)
 DUST_X_RANGE_M, DUST_Y_RANGE_M = (-0.16, -0.08), (-0.10, 0.07)
-PAN_AHEAD_RANGE_M, PAN_ASIDE_RANGE_M = (0.115, 0.135), (-0.012, 0.012)  # of the dust: somebody held it there
-BRUSH_YAW_RANGE_RAD, PAN_YAW_RANGE_RAD = np.deg2rad((-8, 8)), np.deg2rad((-6, 6))
+PAN_X_RANGE_M, PAN_Y_RANGE_M = (0.00, 0.05), (-0.22, -0.16)  # of its lip
+BRUSH_YAW_RANGE_RAD, PAN_YAW_RANGE_RAD = np.deg2rad((-8, 8)), np.deg2rad((-10, 10))
 
 TOUCHED_SECONDS = 0.3  # for which the held brush has to touch the table
 
@@ -31,10 +33,20 @@ BEHIND_M = 0.045  # of the dust's near side, where the brush comes down
 PRESS_M = 0.002  # of the bristles into the table
 INTO_M = 0.055  # how far the brush goes on from the lip
 
+AHEAD_M = 0.125  # of the dust, where the pan's lip is held
+TILT_RAD = np.deg2rad(40)  # of the hand that holds the pan, away from the other
+BEYOND_M = 0.012  # how far its fingertips reach past the handle's middle
+LIP_DOWN_RAD = np.deg2rad(2.5)  # that the pan is tilted by, so that its lip lies on the table
+CARRY_M = 0.03  # that the pan is lifted by
+LEFT, RIGHT = 0, 1
+
 
 class SweepEnv(AlohaEnv):
-    """Success: the object lies in the dustpan, swept there by a brush that touched the table."""
+    """Success: the object lies in the dustpan, which is held or on the table, swept there by a held brush that touched
+    the table."""
 
+    end_effectors: ClassVar[tuple[str, ...]] = ("left", "right")
+    beside = ((0.02, -0.95, 0.60), (0.0, 0.0, 0.08))
     dust: Dust
     brush: Brush
     pan: Dustpan
@@ -46,8 +58,7 @@ class SweepEnv(AlohaEnv):
         rng = self.draw("pose")
         brush = facing(rng.uniform(*BRUSH_X_RANGE_M), rng.uniform(*BRUSH_Y_RANGE_M), rng.uniform(*BRUSH_YAW_RANGE_RAD))
         x, y = rng.uniform(*DUST_X_RANGE_M), rng.uniform(*DUST_Y_RANGE_M)
-        ahead, aside = rng.uniform(*PAN_AHEAD_RANGE_M), rng.uniform(*PAN_ASIDE_RANGE_M)
-        pan = facing(x + ahead, y + aside, rng.uniform(*PAN_YAW_RANGE_RAD))
+        pan = facing(rng.uniform(*PAN_X_RANGE_M), rng.uniform(*PAN_Y_RANGE_M), rng.uniform(*PAN_YAW_RANGE_RAD))
         self.brush.build(spec, "brush", brush)
         self.pan.build(spec, "dustpan", pan)
         self.dust.build(spec, "dust", facing(x, y, rng.uniform(-np.pi, np.pi)))
@@ -62,39 +73,52 @@ class SweepEnv(AlohaEnv):
         x, y, z = transform_points(invert_pose(self.pose_of("dustpan")), self.pose_of("dust")[:3, 3])
         inside = self.pan.lip < x < self.pan.depth and abs(y) < self.pan.width / 2 and z < self.pan.wall
         touched = self._touched >= TOUCHED_SECONDS
-        return {"success": bool(inside and touched), "inside": bool(inside), "touched": touched, "short": -float(x)}
+        kept = self.is_held("dustpan", "right") or self.touch("dustpan", "world") > 0
+        success = bool(inside and touched and kept)
+        return {"success": success, "inside": bool(inside), "touched": touched, "kept": kept, "short": -float(x)}
 
 
 def sweep(env: SweepEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Take the brush by its handle, set it down behind the dust, push that over the lip, and lift the brush."""
+    """Hold the pan ahead of the dust with one hand; with the other take the brush by its handle, set it down behind
+    the dust, push that over the lip, and lift the brush."""
     brush, dust, pan = (env.pose_of(name) for name in ("brush", "dust", "dustpan"))
-    yaw = float(np.arctan2(brush[1, 0], brush[0, 0]))
-    hold = env.brush.height - HOLD_M
-    x, y = brush[:2, 3].tolist()
+
+    def at(x: float, y: float, height: float, yaw: float = 0.0) -> FloatArray:
+        return downward(x, y, height, yaw)[None]
+
+    def holding(pan: FloatArray, height: float = 0.0) -> FloatArray:
+        return (pan @ grip(over(env.pan.grip, height), TILT_RAD, np.pi, BEYOND_M))[None]
 
     # The brush stays square to the table and goes straight on, over the lip.
-    reach = max(env.dust.size[:2]) / 2 + env.brush.depth / 2
-    start = dust[:2, 3] - np.array([reach + BEHIND_M, 0.0])
-    lip = np.array([pan[0, 3] - env.brush.depth / 2, dust[1, 3]])
-    stop = lip + np.array([INTO_M, 0.0])
-
-    def at(place: FloatArray, height: float) -> FloatArray:
-        return downward(float(place[0]), float(place[1]), height)
+    hold = env.brush.height - HOLD_M
+    x, y = brush[:2, 3].tolist()
+    yaw = float(np.arctan2(brush[1, 0], brush[0, 0]))
+    dust_x, dust_y = dust[:2, 3].tolist()
+    behind = dust_x - max(env.dust.size[:2]) / 2 - env.brush.depth / 2 - BEHIND_M
+    lip = dust_x + AHEAD_M - env.brush.depth / 2
+    inside = lip + INTO_M
+    ahead = make_pose(Rotation.from_euler("y", -LIP_DOWN_RAD).as_matrix(), (dust_x + AHEAD_M, dust_y, 0.0))
 
     return [
-        Stroke(np.array([downward(x, y, env.brush.height + ABOVE_M, yaw)]), closed=False, free=True, error=0.003),
-        Stroke(np.array([downward(x, y, hold, yaw)]), closed=True, speed=0.10, error=0.0015),
-        Stroke(np.array([downward(x, y, hold + LIFT_M, yaw)]), closed=True, speed=0.12, error=0.003),
-        Stroke(at(start, hold + LIFT_M)[None], closed=True, speed=0.20, error=0.004),
-        Stroke(at(start, hold - PRESS_M)[None], closed=True, speed=0.10, error=0.0015, pause=0.2),
+        Stroke(holding(pan, ABOVE_M), closed=False, free=True, error=0.003, hand=RIGHT),
+        Stroke(at(x, y, env.brush.height + ABOVE_M, yaw), closed=False, free=True, error=0.003),
+        Stroke(holding(pan), closed=True, speed=0.10, error=0.0015, hand=RIGHT),
+        Stroke(at(x, y, hold, yaw), closed=True, speed=0.10, error=0.0015, waits=True),
+        Stroke(holding(pan, CARRY_M), closed=True, speed=0.12, error=0.003, hand=RIGHT),
+        Stroke(holding(ahead, CARRY_M), closed=True, speed=0.16, error=0.003, hand=RIGHT),
+        Stroke(holding(ahead, -PRESS_M), closed=True, speed=0.08, error=0.0015, hand=RIGHT),
+        Stroke(at(x, y, hold + LIFT_M, yaw), closed=True, speed=0.12, error=0.003),
+        Stroke(at(behind, dust_y, hold + LIFT_M), closed=True, speed=0.20, error=0.004),
+        Stroke(at(behind, dust_y, hold - PRESS_M), closed=True, speed=0.10, error=0.0015, pause=0.2),
         Stroke(
-            np.array([at(lip, hold - PRESS_M), at(stop, hold + env.pan.floor)]),
+            np.concatenate([at(lip, dust_y, hold - PRESS_M), at(inside, dust_y, hold + env.pan.floor)]),
             closed=True,
             speed=0.09,
             error=0.0015,
             pause=0.2,
+            waits=True,
         ),
-        Stroke(at(stop, hold + AWAY_M)[None], closed=True, speed=0.12, error=0.004),
+        Stroke(at(inside, dust_y, hold + AWAY_M), closed=True, speed=0.12, error=0.004),
     ]
 
 
@@ -105,6 +129,8 @@ def verdict(env: SweepEnv) -> str:
         return ""
     if not state["inside"]:
         return f"the object is not in the dustpan, but {1e3 * state['short']:.0f} mm before its lip"
+    if not state["kept"]:
+        return "the object is in the dustpan, but that is neither held nor on the table"
     return "the object is in the dustpan, but the brush hardly touched the table"
 
 

@@ -165,6 +165,6 @@ class CellEnv(BaseEnv):
         """RGB frame ``(H, W, 3)`` uint8 of the camera beside the table."""
         return self.render_rgb_array()[0].cpu().numpy().astype(np.uint8)
 
-    def tool_pose(self) -> FloatArray:
-        """Where the tool frame is, ``(4, 4)``."""
-        return self.agent.tcp._objs[0].pose.to_transformation_matrix().astype(np.float64)
+    def tool_poses(self) -> FloatArray:
+        """Where the arm's tool frame is, ``(1, 4, 4)``."""
+        return self.agent.tcp._objs[0].pose.to_transformation_matrix().astype(np.float64)[None]

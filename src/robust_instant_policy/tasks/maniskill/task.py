@@ -20,7 +20,7 @@ class CellTask(SimulatedTask):
     def __init__(self, spec: TaskSpec, objects: str, assets: str):
         require_renderer()
         env = gymnasium.make(spec.env_id, obs_mode="none", reward_mode="none", objects=objects, assets=assets)
-        super().__init__(spec, env.unwrapped, ur5e_hande(), TIMING, WORKSPACE)
+        super().__init__(spec, env.unwrapped, [ur5e_hande()], TIMING, WORKSPACE)
         # The simulator searches the whole process for garbage whenever it rebuilds a scene. What lives by now (torch
         # and its like) lives on; sparing it makes a reset several times faster.
         gc.collect()
