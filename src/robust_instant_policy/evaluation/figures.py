@@ -6,6 +6,7 @@ import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 
 import matplotlib
 import numpy as np
@@ -19,6 +20,7 @@ from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.policies import Plan
 
 WIDTH_IN, HEIGHT_IN = 7.0, 2.8  # of a figure over both columns of a paper
+LINE_CHARACTERS = 75  # that fit below such a figure, side by side
 PNG_DPI = 200
 MM = 1000.0
 PARAMETERS = {
@@ -112,7 +114,8 @@ def _bars(axes: Axes, summary: Summary, styles: Sequence[Style], labels: Sequenc
             told = paper.table1(variant.method, task)
             if told is not None and summary.suite.name != "downsampling":
                 _told(axes, group + offset, width, told)
-    axes.set_xticks(range(len(groups)), groups)
+    room = max(8, LINE_CHARACTERS // len(groups))  # names break at their hyphens
+    axes.set_xticks(range(len(groups)), [fill(group, room) for group in groups])
     _success_axis(axes)
 
 
