@@ -201,12 +201,12 @@ class AlohaEnv(gymnasium.Env):
 
     def touch(self, body: str, other: str) -> float:
         """Force, in N, with which two bodies press on each other."""
-        wanted = {self.model.body(body).id, self.model.body(other).id}
+        wanted = sorted((self.model.body(body).id, self.model.body(other).id))
+        touching = np.sort(self.model.geom_bodyid[self.data.contact.geom], axis=1)
         total, force = 0.0, np.zeros(6)
-        for index, contact in enumerate(self.data.contact[: self.data.ncon]):
-            if {int(self.model.geom_bodyid[geom]) for geom in contact.geom} == wanted:
-                mujoco.mj_contactForce(self.model, self.data, index, force)
-                total += float(force[0])
+        for index in np.flatnonzero((touching == wanted).all(axis=1)):
+            mujoco.mj_contactForce(self.model, self.data, index, force)
+            total += float(force[0])
         return total
 
     def is_held(self, body: str, side: str = "left") -> bool:
