@@ -39,12 +39,14 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data"))
     parser.add_argument("--samples", type=Path, required=True)
     parser.add_argument("--tasks", nargs="+", default=["push-cube", "turn-faucet", "pick-banana"])
+    parser.add_argument("--objects", choices=("seen", "unseen"), default="seen")
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--scaling", action="store_true")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     base = Variant("rip", model=model_name("embedded"))
-    (suite,) = make_suites(["table1"], Choice(base, options.tasks, METHODS, options.episodes))
+    choice = Choice(base, options.tasks, METHODS, options.episodes, objects=options.objects)
+    (suite,) = make_suites(["table1"], choice)
     with tempfile.TemporaryDirectory() as folder:
         store = Path(folder) / "samples.sqlite"
         shutil.copy(options.samples, store)
