@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,6 +46,11 @@ TIMES = ("seconds", "physics_seconds")
 
 def timeless(rows: list[Episode]) -> set[tuple]:
     return {tuple(value for name, value in vars(row).items() if name not in TIMES) for row in rows}
+
+
+def is_running(process: int) -> bool:
+    stat = Path(f"/proc/{process}/stat")
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +95,25 @@ def test_two_workers_of_which_one_is_killed_write_the_rows_that_one_writes(inter
     assert killed
     assert timeless(open_episodes(tmp_path).rows) == timeless(rows)
     assert not multiprocessing.active_children()
+
+
+def test_a_worker_in_the_middle_of_something_ends_with_the_evaluation_that_was_killed(tmp_path):
+    script = tmp_path / "evaluation.py"
+    script.write_text(
+        "import multiprocessing, time\n"
+        "from robust_instant_policy.evaluation.processes import end_with_parent\n\n"
+        "def work():\n    end_with_parent()\n    print('at work', flush=True)\n    time.sleep(600)\n\n"
+        "if __name__ == '__main__':\n"
+        "    worker = multiprocessing.get_context('spawn').Process(target=work)\n"
+        "    worker.start()\n    print(worker.pid, flush=True)\n    worker.join()\n"
+    )
+    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    said = {parent.stdout.readline().strip(), parent.stdout.readline().strip()}
+    (worker,) = said - {"at work"}
+    parent.kill()
+    parent.communicate(timeout=60)  # the worker holds the pipe as long as it lives
+    assert not is_running(int(worker))
 
 
 def test_a_ray_cluster_writes_the_rows_that_a_process_writes(interrupted, workbench, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -128,9 +129,25 @@ def one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
+def end_with_parent() -> None:
+    """Have this process end at once when the one that started it is no more, killed or not.
+
+    It would find out only with its next row, and plan on for minutes until then.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def _serve(pipe: Connection, setup: Setup) -> None:
     """The life of a worker: a scene comes in, its outcomes go out one by one, until nobody listens any more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who keeps the rows
+    end_with_parent()
     bench = Workbench(setup)
     try:
         while True:
