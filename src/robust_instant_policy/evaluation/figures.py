@@ -197,13 +197,14 @@ def _downsampling(summary: Summary) -> Figure:
 def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan]) -> Figure:
     """Palm position over time in the scene in which RIP and the Gaussian part the most (Oh et al. 2025, Fig. 4a)."""
     figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
-    panels = figure.subplots(1, 3, sharex=True)
     by_scene: dict[Scene, dict[str, Plan]] = {}
     for (scene, variant), plan in plans.items():
         by_scene.setdefault(scene, {})[variant.method] = plan
     whole = {scene: of for scene, of in by_scene.items() if {"rip", "rip-gauss"} <= of.keys()}
     if not whole:
+        figure.text(0.5, 0.5, "no scene has been planned by both rip and rip-gauss yet", ha="center")
         return figure
+    panels = figure.subplots(1, 3, sharex=True)
     scene = max(whole, key=lambda one: _worth_showing(whole[one]["rip"], whole[one]["rip-gauss"]))
     robust, gauss = whole[scene]["rip"], whole[scene]["rip-gauss"]
     for axis, panel in enumerate(panels):
