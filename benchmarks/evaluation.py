@@ -19,9 +19,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from robust_instant_policy.evaluation.processes import ONE_THREAD
-
-os.environ.update(ONE_THREAD)  # as the workers have it; before anything computes
+# As the workers have it, or prompts differ in their last digits; before numpy is imported.
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
 from robust_instant_policy.evaluation import Choice, Progress, Setup, Suite, Variant, make_suites, run_suites
 from robust_instant_policy.evaluation.episodes import Episode
