@@ -238,7 +238,10 @@ def _reading(summary: Summary) -> str:
 
 
 def _p(value: float) -> str:
-    return NONE if math.isnan(value) else f"{value:.3f}{mark(value).replace('*', chr(92) + '*')}"
+    if math.isnan(value):
+        return NONE
+    shown = f"{value:.3f}" if value >= 0.0005 else "< 0.001"
+    return shown + mark(value).replace("*", chr(92) + "*")
 
 
 def _with_tests(summary: Summary) -> list[Table]:
