@@ -1,5 +1,7 @@
-"""Recorded once a test run: demonstrations and a scene of the real simulator."""
+"""Once a test run: demonstrations and a scene of the real simulator are recorded, and Ctrl-C is made to work."""
 
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -7,6 +9,14 @@ import pytest
 from robust_instant_policy.cli import main
 
 NUM_DEMONSTRATIONS = 5
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ctrl_c() -> Iterator[None]:
+    """Shells start background jobs with Ctrl-C ignored; the programs that tests stop with it would inherit that."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")
