@@ -2,9 +2,10 @@
 
 "Move to 4 cm above the cup" is the same numbers in every demonstration when it is written in the cup's frame, and
 different ones in the world's. Which frame that is changes over a task (first the cup, then the saucer) and is
-found from the demonstrations alone: candidates are the world, each keypoint, and rigid frames fitted to keypoints
-that keep their distances to each other; dynamic programming finds the sequence of frames with the
-smallest spread across demonstrations, paying a price for each change of frame.
+found from the demonstrations alone: candidates are the world, each keypoint, rigid frames fitted to keypoints
+that keep their distances to each other, and frames on the way between two of these, for the motion from the one to
+the other; dynamic programming finds the sequence of frames with the smallest spread across demonstrations, paying a
+price for each change of frame.
 """
 
 from __future__ import annotations
@@ -31,9 +32,16 @@ TILT_COST = 0.1  # of frames that agree equally, the one that stays upright
 DISTANCE_COST_PER_M = 4.0  # divided by the number of demonstrations: the fewer, the more it matters what is near
 WORLD_DISTANCE_M = 0.25  # the world frame counts as being this far away
 
+SHARES = tuple(np.arange(1, 8) / 8)  # of the way between two frames at which there is one more
+MOST_OBJECTS = 3  # with ways between them and the world
+BETWEEN_COST = 0.1  # of frames that agree equally, one that is not on the way,
+BETWEEN_COST_OF_FEW = 1.0  # divided by the number of demonstrations: among few, some share of the way agrees by chance
+BOARDING_COST = 0.5  # of going over from a frame to the way that begins or ends there: both are no dearer than a change
+ALONG_COST = 0.05  # of going on along the way
+
 MAD_TO_STD = 1.4826
 
-Kind = Literal["world", "keypoint", "upright", "rigid"]
+Kind = Literal["world", "keypoint", "upright", "rigid", "between"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,17 +50,23 @@ class Frame:
 
     ``world`` is the world itself; ``keypoint`` keeps the world's axes with its origin at the keypoint; ``upright``
     also turns about the vertical with the keypoints ``members``, ``rigid`` in all directions. ``shape (N, 3)`` are
-    the members' places in the frame.
+    the members' places in the frame. ``between`` lies the ``share`` of the way from the first of ``ends`` to the
+    second, and is turned the share ``turn`` of the angle from the one to the other.
     """
 
     kind: Kind
     members: tuple[int, ...] = ()
     shape: FloatArray | None = None
+    ends: tuple[Frame, Frame] | None = None
+    share: float = 0.0
+    turn: float = 0.0
 
     def pose(self, keypoints: FloatArray) -> FloatArray:
         """The frame's pose ``(4, 4)`` in the scene of ``keypoints (K, 3)``."""
         if self.kind == "world":
             return np.eye(4)
+        if self.ends is not None:
+            return _between(*(end.pose(keypoints) for end in self.ends), self.share, self.turn)
         points = keypoints[list(self.members)]
         if self.kind == "keypoint":
             return make_pose(np.eye(3), points[0])
@@ -62,8 +76,20 @@ class Frame:
     def __str__(self) -> str:
         if self.kind == "world":
             return "world"
+        if self.ends is not None:
+            return f"{self.share:.0%} of the way from ({self.ends[0]}) to ({self.ends[1]}), turned {self.turn:.0%}"
         names = " ".join(str(member) for member in self.members)
         return f"keypoint {names}" if self.kind == "keypoint" else f"{self.kind} on keypoints {names}"
+
+
+    def goes_with(self, other: Frame) -> bool:
+        """Whether both are the same frame, or lie on the same way."""
+        return self is other or (self.ends is not None and self.ends == other.ends and self._turning == other._turning)
+
+    @property
+    def _turning(self) -> float | None:
+        """What of the angle it is turned, where that does not grow along the way."""
+        return None if self.turn == self.share else self.turn
 
 
 WORLD = Frame("world")
@@ -87,6 +113,21 @@ def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArr
             pose = fit(shape, points, 1 / (1 + (residual / OUTLIER_M) ** 2) ** 2)
         return pose
     return fit(shape, points, np.ones(len(shape)))
+
+
+def _between(first: FloatArray, second: FloatArray, share: float, turn: float) -> FloatArray:
+    """The pose between two poses ``(..., 4, 4)`` whose axes differ by a turn about the vertical only."""
+    relative = np.swapaxes(first[..., :3, :3], -1, -2) @ second[..., :3, :3]
+    angle = turn * np.arctan2(relative[..., 1, 0], relative[..., 0, 0])
+    turned = np.zeros_like(relative)
+    turned[..., 0, 0] = turned[..., 1, 1] = np.cos(angle)
+    turned[..., 1, 0], turned[..., 0, 1] = np.sin(angle), -np.sin(angle)
+    turned[..., 2, 2] = 1.0
+    pose = np.zeros_like(first)
+    pose[..., :3, :3] = first[..., :3, :3] @ turned
+    pose[..., :3, 3] = (1 - share) * first[..., :3, 3] + share * second[..., :3, 3]
+    pose[..., 3, 3] = 1.0
+    return pose
 
 
 def _moved(poses: FloatArray, points: FloatArray) -> FloatArray:
@@ -114,7 +155,8 @@ def candidate_frames(keypoints: FloatArray) -> list[Frame]:
     """Frames worth trying for demonstrations with ``keypoints (I, K, 3)``.
 
     Keypoints belong together when their distance is nearly the same in most demonstrations. Each keypoint gives a
-    frame of its own, and upright and rigid frames on all that belong with it and on the nearest few of them.
+    frame of its own, and upright and rigid frames on all that belong with it and on the nearest few of them. Between
+    the world and the objects, each the largest such frame, lie the frames of the ways between them.
     """
     num_demos, num_points = keypoints.shape[:2]
     frames = [WORLD, *(Frame("keypoint", (k,)) for k in range(num_points))]
@@ -137,7 +179,39 @@ def candidate_frames(keypoints: FloatArray) -> list[Frame]:
             frames.append(Frame("upright", members, _mean_shape(keypoints[:, list(members)], upright=True)))
         if len(members) >= 3:
             frames.append(Frame("rigid", members, _mean_shape(keypoints[:, list(members)], upright=False)))
+    if num_demos >= DEMOS_TO_TELL_OBJECTS:
+        for ends in combinations([WORLD, *_objects(frames)], 2):
+            members = ends[0].members + ends[1].members
+            for share in SHARES:
+                frames.extend(
+                    Frame("between", members, None, ends, float(share), float(turn)) for turn in (0.0, share, 1.0)
+                )
     return frames
+
+
+def _objects(frames: Sequence[Frame]) -> list[Frame]:
+    """The upright frames on the most keypoints that share none, at most `MOST_OBJECTS`."""
+    objects: list[Frame] = []
+    for frame in sorted(frames, key=lambda frame: -len(frame.members)):
+        taken = {member for other in objects for member in other.members}
+        if frame.kind == "upright" and taken.isdisjoint(frame.members):
+            objects.append(frame)
+    return objects[:MOST_OBJECTS]
+
+
+def poses_in(frames: Sequence[Frame], keypoints: FloatArray) -> FloatArray:
+    """Pose of each of ``frames`` in each scene of ``keypoints (I, K, 3)``: ``(F, I, 4, 4)``."""
+    known: dict[int, FloatArray] = {}
+
+    def poses(frame: Frame) -> FloatArray:
+        if id(frame) not in known:
+            if frame.ends is None:
+                known[id(frame)] = np.stack([frame.pose(points) for points in keypoints])
+            else:
+                known[id(frame)] = _between(*map(poses, frame.ends), frame.share, frame.turn)
+        return known[id(frame)]
+
+    return np.stack([poses(frame) for frame in frames])
 
 
 def _mean_shape(points: FloatArray, upright: bool) -> FloatArray:
@@ -179,18 +253,29 @@ def choose_frames(
     for own, frame in zip(cost, frames, strict=True):
         own += FEW_POINTS_COST / max(len(frame.members), 1) * (frame.kind != "world")
         own += TILT_COST * (frame.kind == "rigid")
+        own += (BETWEEN_COST + BETWEEN_COST_OF_FEW / points.shape[0]) * (frame.kind == "between")
     weight = np.ones(points.shape[1])
     weight[list(key_steps)] = KEY_STEP_WEIGHT
     cost = cost * weight
 
+    change = np.array([[_change(frame, other) for other in frames] for frame in frames])
     total = cost[:, 0]
     origin = np.zeros((len(frames), points.shape[1]), dtype=np.intp)
     for step in range(1, points.shape[1]):
-        best = int(np.argmin(total))
-        switch = total[best] + SWITCH_COST
-        origin[:, step] = np.where(total <= switch, np.arange(len(frames)), best)
-        total = np.minimum(total, switch) + cost[:, step]
+        reached = total[:, None] + change
+        origin[:, step] = reached.argmin(axis=0)
+        total = reached.min(axis=0) + cost[:, step]
     chosen = [int(np.argmin(total))]
     for step in range(points.shape[1] - 1, 0, -1):
         chosen.append(int(origin[chosen[-1], step]))
     return chosen[::-1]
+
+
+def _change(frame: Frame, other: Frame) -> float:
+    """The price of writing one step in ``frame`` and the next in ``other``."""
+    if frame is other:
+        return 0.0
+    if frame.goes_with(other):
+        return ALONG_COST
+    boards = (frame.ends is not None and other in frame.ends) or (other.ends is not None and frame in other.ends)
+    return BOARDING_COST if boards else SWITCH_COST

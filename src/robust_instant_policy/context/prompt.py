@@ -20,7 +20,7 @@ from robust_instant_policy.context.codec import (
     rows_pattern,
     write_row,
 )
-from robust_instant_policy.context.frames import WORLD, Frame, candidate_frames, choose_frames
+from robust_instant_policy.context.frames import WORLD, Frame, candidate_frames, choose_frames, poses_in
 from robust_instant_policy.errors import InvalidValueError, PlanningError
 from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
 from robust_instant_policy.query import Query
@@ -241,7 +241,7 @@ class InContextPrompt:
             self.frames_ = [[WORLD] * steps] * self._num_arms
             return
         candidates = candidate_frames(self._keypoints)
-        poses = np.stack([np.stack([frame.pose(points) for points in self._keypoints]) for frame in candidates])
+        poses = poses_in(candidates, self._keypoints)
         rows = actions.reshape(len(actions), steps, self._num_arms, ACTION_DIM)[..., :STATE_INDEX]
         triplets = rows.reshape(*rows.shape[:-1], 3, 3)
         self.frames_ = [
@@ -251,9 +251,8 @@ class InContextPrompt:
 
     def _poses(self, keypoints: FloatArray) -> FloatArray:
         """Pose of the frame of each step and arm ``(T, A, 4, 4)``."""
-        known = {id(frame): frame for frames in self.frames_ for frame in frames}
-        poses = {key: frame.pose(keypoints) for key, frame in known.items()}
-        return np.stack([[poses[id(frame)] for frame in frames] for frames in zip(*self.frames_, strict=True)])
+        frames = [frame for of_step in zip(*self.frames_, strict=True) for frame in of_step]
+        return poses_in(frames, keypoints[None])[:, 0].reshape(-1, self._num_arms, 4, 4)
 
     def _encode(self, keypoints: FloatArray, actions: FloatArray) -> FloatArray:
         """Numbers ``(T, 10·A)``: in each step's frame, in millimetres, the point between the fingertips, then the palm
@@ -290,8 +289,8 @@ class InContextPrompt:
 
 
 def _neighbours(frames: Sequence[Frame], most: int) -> list[tuple[int, ...]]:
-    """Runs of at most ``most`` steps written in the same frame, of nearly equal length within each frame's run."""
-    starts = [0, *(step for step in range(1, len(frames)) if frames[step] is not frames[step - 1]), len(frames)]
+    """Runs of at most ``most`` steps written in the same frame, or on one way, of nearly equal length within each run."""
+    starts = [0, *(step for step in range(1, len(frames)) if not frames[step].goes_with(frames[step - 1])), len(frames)]
     blocks = []
     for start, stop in pairwise(starts):
         for part in np.array_split(np.arange(start, stop), -(-(stop - start) // most)):
