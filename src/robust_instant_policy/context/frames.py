@@ -81,7 +81,6 @@ class Frame:
         names = " ".join(str(member) for member in self.members)
         return f"keypoint {names}" if self.kind == "keypoint" else f"{self.kind} on keypoints {names}"
 
-
     def goes_with(self, other: Frame) -> bool:
         """Whether both are the same frame, or lie on the same way."""
         return self is other or (self.ends is not None and self.ends == other.ends and self._turning == other._turning)

@@ -289,7 +289,7 @@ class InContextPrompt:
 
 
 def _neighbours(frames: Sequence[Frame], most: int) -> list[tuple[int, ...]]:
-    """Runs of at most ``most`` steps written in the same frame, or on one way, of nearly equal length within each run."""
+    """Runs of at most ``most`` steps in the same frame, or on one way, of nearly equal length within each run."""
     starts = [0, *(step for step in range(1, len(frames)) if not frames[step].goes_with(frames[step - 1])), len(frames)]
     blocks = []
     for start, stop in pairwise(starts):
