@@ -66,7 +66,7 @@ class Frame:
         if self.kind == "world":
             return np.eye(4)
         if self.ends is not None:
-            return _between(*(end.pose(keypoints) for end in self.ends), self.share, self.turn)
+            return _between(self.ends[0].pose(keypoints), self.ends[1].pose(keypoints), self.share, self.turn)
         points = keypoints[list(self.members)]
         if self.kind == "keypoint":
             return make_pose(np.eye(3), points[0])
@@ -207,7 +207,8 @@ def poses_in(frames: Sequence[Frame], keypoints: FloatArray) -> FloatArray:
             if frame.ends is None:
                 known[id(frame)] = np.stack([frame.pose(points) for points in keypoints])
             else:
-                known[id(frame)] = _between(*map(poses, frame.ends), frame.share, frame.turn)
+                first, second = frame.ends
+                known[id(frame)] = _between(poses(first), poses(second), frame.share, frame.turn)
         return known[id(frame)]
 
     return np.stack([poses(frame) for frame in frames])
