@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from robust_instant_policy.context import InContextPrompt
-from robust_instant_policy.context.alignment import align
-from robust_instant_policy.context.frames import robust_fit
+from robust_instant_policy.context.alignment import align, usual_bends
+from robust_instant_policy.context.frames import Frame, robust_fit
 from robust_instant_policy.errors import InvalidValueError, PlanningError
 from robust_instant_policy.geometry import GripperTriangle, make_pose
 from robust_instant_policy.trajectory import Trajectory
@@ -131,6 +131,67 @@ def there_and_back(trajectory: Trajectory) -> Trajectory:
     return Trajectory.from_actions(np.concatenate([trajectory.actions, trajectory.actions[::-1]], axis=1))
 
 
+def test_what_is_on_the_way_between_two_objects_is_followed_there():
+    keypoints, trajectories = demonstrations()
+    prompt = InContextPrompt().fit(keypoints, [half_way(*pair) for pair in zip(keypoints, trajectories, strict=True)])
+    frame = prompt.frames_[0][-1]
+    assert frame.kind == "between"
+    assert (frame.share, frame.turn) == (0.5, 1.0)
+    for seed in range(100, 110):
+        new, truth = scene(seed)
+        planned = prompt.median_trajectory(new)
+        assert np.linalg.norm(planned.triplets[-1] - half_way(new, truth).triplets[-1], axis=-1).max() < 0.008
+
+
+def half_way(keypoints: np.ndarray, trajectory: Trajectory) -> Trajectory:
+    """Turned as it was, but ends half-way between the two objects."""
+    middles = keypoints.reshape(2, 5, 3).mean(axis=1)
+    actions = trajectory.actions.copy()
+    actions[12:, :9] += np.tile((middles[0] - middles[1]) / 2, 3)
+    return Trajectory.from_actions(actions)
+
+
+def test_free_motion_is_written_on_the_way_and_does_not_jump():
+    starts, stops = np.random.default_rng(0).uniform(-0.15, 0.15, (2, 8, 3)) * [1, 1, 0]
+    keypoints = np.concatenate([SHAPES[0] + starts[:, None], SHAPES[1] + [0.0, 0.5, 0.0] + stops[:, None]], axis=1)
+    trajectories: list[Trajectory] = []
+    for start, stop in zip(starts, stops, strict=True):
+        way = stop - start + np.array([0.0, 0.5, 0.0])
+        poses = np.stack([make_pose(DOWN, start + share * way) for share in np.linspace(0, 1, 20)])
+        trajectories.append(Trajectory.from_poses(poses, np.zeros(20), TRIANGLE))
+    prompt = InContextPrompt().fit(keypoints[:7], trajectories[:7])
+    assert sum(frame.kind == "between" for frame in prompt.frames_[0]) >= 12
+    planned = prompt.median_trajectory(keypoints[7])
+    assert np.linalg.norm(planned.triplets - trajectories[7].triplets, axis=-1).max() < 0.015
+    one_way = [question.asked for question in prompt._questions if len({step for step, _ in question.asked}) > 1]
+    assert one_way  # steps on one way are asked for together, though each has a frame of its own
+
+
+def test_a_way_between_frames_turns_with_neither_either_or_along():
+    keypoints, _ = demonstrations()
+    first, second = (Frame("upright", tuple(range(5 * i, 5 * i + 5)), SHAPES[i]) for i in range(2))
+    poses = [frame.pose(keypoints[0]) for frame in (first, second)]
+    for turn, like in ((0.0, 0), (1.0, 1)):
+        pose = Frame("between", (), None, (first, second), 0.25, turn).pose(keypoints[0])
+        assert np.allclose(pose[:3, :3], poses[like][:3, :3])
+        assert np.allclose(pose[:3, 3], 0.75 * poses[0][:3, 3] + 0.25 * poses[1][:3, 3])
+    half = Frame("between", (), None, (first, second), 0.5, 0.5).pose(keypoints[0])[:3, :3]
+    step = poses[0][:3, :3].T @ half
+    assert np.allclose(poses[0][:3, :3] @ step @ step, poses[1][:3, :3])
+
+
+def test_bends_are_those_of_the_demonstrations_whatever_their_number():
+    _, trajectories = demonstrations()
+    bends = usual_bends(trajectories)
+    assert bends.shape == (24,)
+    assert bends.max() > 3 * bends.min()
+    assert np.allclose(usual_bends(trajectories[:1] * 3), usual_bends(trajectories[:1]))
+    assert (usual_bends([trajectories[0].subset([0, 1])]) > 0).all()
+    assert InContextPrompt("world", "sequence").fit(*demonstrations(3)).bends_.min() == pytest.approx(
+        usual_bends(demonstrations(3)[1]).max()
+    )
+
+
 def test_one_demonstration_is_enough_to_follow_an_object():
     keypoints, trajectories = demonstrations(1)
     prompt = InContextPrompt().fit(keypoints, trajectories)
@@ -167,6 +228,8 @@ def test_moving_the_whole_scene_moves_the_plan_with_it_except_where_the_world_co
     before = prompt.median_trajectory(new).triplets
     after = prompt.median_trajectory(new @ turn.T + shift).triplets
     for step, frame in enumerate(prompt.frames_[0]):
+        if frame.ends is not None and frame.ends[0].kind == "world":
+            continue
         expected = before[step] if frame.kind == "world" else before[step] @ turn.T + shift
         assert np.allclose(after[step], expected, atol=1e-6)
 

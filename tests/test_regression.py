@@ -228,3 +228,48 @@ def test_the_benchmark_runs():
 def test_importing_the_regression_needs_no_torch():
     code = "import robust_instant_policy.regression, sys; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def disagreeing(num_steps=20):
+    """A straight way on which five candidates agree, except that at one step none does and two meet far off."""
+    truth = np.linspace([0.0, 0.0, 0.3], [0.4, 0.2, 0.1], num_steps)
+    candidates = np.tile(truth, (5, 1, 1)) + np.random.default_rng(0).normal(0, 0.001, (5, num_steps, 3))
+    candidates[:, 10, 1] += [0.1, 0.1, -0.08, 0.15, -0.12]
+    return truth, list(candidates)
+
+
+def test_where_candidates_disagree_the_curve_goes_on_as_it_may_be_expected_to():
+    truth, candidates = disagreeing()
+    groups = np.zeros(3)
+    jumps = StudentTRegression(groups=groups).fit(candidates)
+    straight = StudentTRegression(groups=groups, bends=np.full(5, 0.02 * (19 / 4) ** 2)).fit(candidates)
+    assert np.abs(jumps.mean() - truth)[10].max() > 0.05
+    assert np.abs(straight.mean() - truth)[10].max() < 0.015
+    assert np.abs(straight.mean() - jumps.mean())[[0, 5, 15, 19]].max() < 0.001
+    assert straight.standard_error()[10].max() > 1.5 * straight.standard_error()[5].max()
+
+
+@pytest.mark.parametrize("kind", ["offset", "digits", "freeze"])
+def test_the_likelihood_never_falls_with_known_bends_either(kind):
+    for seed in range(4):
+        scene = draw_scene(seed, "piecewise", 5, 2, kind)
+        fit = StudentTRegression(groups=POINTS, bends=[0.01, 0.03, 0.01]).fit(points(scene))
+        assert (np.diff(fit.log_likelihood) > -1e-6 * np.abs(fit.log_likelihood[:-1])).all()
+        assert fit.converged
+
+
+def test_known_bends_leave_the_gaussian_the_mean_of_the_candidates():
+    _, candidates = disagreeing()
+    fit = StudentTRegression(np.inf, groups=np.zeros(3), bends=[0.001, 0.001]).fit(candidates)
+    assert np.allclose(fit.mean(), np.mean(candidates, axis=0))
+
+
+@pytest.mark.parametrize("bends", [[0.01], [[0.01, 0.01]], [0.01, 0.0], [0.01, np.nan]])
+def test_bends_that_say_nothing_are_refused(bends):
+    with pytest.raises(InvalidValueError, match=r"bends must be \(B,\)"):
+        StudentTRegression(bends=bends)
+
+
+def test_bends_of_dimensions_in_different_units_are_refused():
+    with pytest.raises(InvalidValueError, match="bends need groups"):
+        StudentTRegression(bends=[0.01, 0.01]).fit([np.zeros((4, 2))])

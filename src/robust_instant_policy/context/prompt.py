@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from robust_instant_policy.context.alignment import align
+from robust_instant_policy.context.alignment import align, usual_bends
 from robust_instant_policy.context.codec import (
     MM,
     millimetres,
@@ -70,7 +70,8 @@ class InContextPrompt:
     ``order="nearest-last"`` puts the demonstrations whose keypoints lie nearest to the new scene's at the end, at
     the cost that a model cannot go on from what it read for the last scene, as it can with ``"given"``.
 
-    After `fit`, ``frames_`` lists for each arm the frame of each step.
+    After `fit`, ``frames_`` lists for each arm the frame of each step, and ``bends_ (B,)``, metres, evenly spread over
+    the trajectories to come, says how sharply the demonstrations' gripper turns (see `usual_bends`).
     """
 
     def __init__(self, frames: Frames = "adaptive", layout: Layout = "factorised", order: Order = "given"):
@@ -97,13 +98,15 @@ class InContextPrompt:
         self._num_keypoints = keypoints.shape[1]
         self._num_arms = widths.pop() // ACTION_DIM
         if self.frames == "world" and self.layout == "sequence":
-            # The paper's prompt: trajectories as they are, whatever their lengths.
+            # The paper's prompt: trajectories as they are, whatever their lengths and wherever the gripper changes.
+            self.bends_ = np.full(max(map(len, trajectories)), usual_bends(trajectories).max())
             self._lengths = [len(trajectory) for trajectory in trajectories]
             self.frames_: list[list[Frame]] = [[WORLD] * max(self._lengths)] * self._num_arms
             self._keypoints = keypoints
             self._write_sequences([_world_rows(trajectory) for trajectory in trajectories])
             return self
         aligned = align(trajectories)
+        self.bends_ = usual_bends(trajectories)
         self._keypoints = keypoints[list(aligned.kept)]
         self._lengths = [aligned.actions.shape[1]]
         self._choose_frames(aligned.actions, aligned.key_steps)

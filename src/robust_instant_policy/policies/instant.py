@@ -28,12 +28,16 @@ QUOTED_ANSWER_CHARS = 160
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """What the instant policy saw and proposed for one observation."""
+    """What the instant policy saw and proposed for one observation.
+
+    ``bends (B,)``, metres, say how sharply the demonstrations' gripper turns along the way, if that is known.
+    """
 
     located: Located
     candidates: tuple[Trajectory, ...]
     usage: Usage
     notes: tuple[str, ...]
+    bends: FloatArray | None = None
 
 
 class InstantPolicy:
@@ -115,7 +119,8 @@ class InstantPolicy:
         notes = (*self.context.extractor.notes_, *heard.located.notes)
         if count < num_queries:
             notes = (*notes, f"{count} of {num_queries} answers were usable in time")
-        return Proposal(heard.located, candidates, Usage((heard.locating, _sampling(heard, answers))), notes)
+        usage = Usage((heard.locating, _sampling(heard, answers)))
+        return Proposal(heard.located, candidates, usage, notes, self.prompt.bends_)
 
     def _ask(self, heard: _Heard, num_queries: int) -> None:
         """Sample what ``heard`` lacks of ``num_queries`` answers a query."""

@@ -40,7 +40,8 @@ class Neighbours:
         with watch.stage("neighbours"):
             candidates = self._frames.carried_over(located.keypoints, self.num_queries)
         notes = (*self.context.extractor.notes_, *located.notes)
-        return robust_plan(Proposal(located, candidates, Usage((locating, *watch.stages)), notes))
+        usage = Usage((locating, *watch.stages))
+        return robust_plan(Proposal(located, candidates, usage, notes, self._frames.bends_))
 
     def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
         """The robust trajectory alone."""

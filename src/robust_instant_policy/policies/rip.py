@@ -72,6 +72,7 @@ def robust_plan(proposal: Proposal, dof: float = DOF, estimator: str = "em", see
             dof=dof,
             estimator=estimator,
             seed=seed,
+            bends=proposal.bends,
         )
     return replace(
         plan_of_first_candidate(proposal),

@@ -57,6 +57,7 @@ def robust_gripper_trajectory(
     seed: int = 0,
     triangle: GripperTriangle | None = None,
     tolerance: float = TOLERANCE_M,
+    bends: ArrayLike | None = None,
 ) -> RobustTrajectory:
     """The robust gripper trajectory of ``candidates``, each ``(T_q, 10·A)``: palm, two fingertips (m), state, per arm.
 
@@ -65,7 +66,8 @@ def robust_gripper_trajectory(
     reference); ``dof`` = inf is the Gaussian ablation, the mean of the candidates. ``times`` are the candidates' own,
     within [0, 1], evenly spread by default; the result has ``num_steps`` steps, by default the median of the
     candidates'. ``triangle`` is the gripper, by default measured from the candidates. ``seed`` is the network's.
-    ``tolerance``, metres, is what `RobustTrajectory.confidence` is about.
+    ``tolerance``, metres, is what `RobustTrajectory.confidence` is about. ``bends (B,)``, metres, say how sharply such
+    a gripper's points turn (see `StudentTRegression`); only "em" asks for them.
     """
     if estimator not in ESTIMATORS:
         raise UnknownNameError("estimator", estimator, ESTIMATORS)
@@ -80,7 +82,7 @@ def robust_gripper_trajectory(
     at = np.linspace(0.0, 1.0, count)
     is_state = np.arange(data.num_dimensions) % ARM_DIM == POINT_DIM
     points = Candidates(data.values[:, ~is_state], data.times, data.starts)
-    fit, residuals = _fit_points(points, dof, estimator, seed)
+    fit, residuals = _fit_points(points, dof, estimator, seed, bends)
     clocks = data.split(data.times)
     weights = np.stack([np.interp(at, clock, weight) for clock, weight in zip(clocks, fit.weights, strict=True)])
 
@@ -115,7 +117,7 @@ def robust_gripper_trajectory(
 
 
 def _fit_points(
-    points: Candidates, dof: float, estimator: str, seed: int
+    points: Candidates, dof: float, estimator: str, seed: int, bends: ArrayLike | None
 ) -> tuple[StudentTRegression | StudentTNetwork | StudentTMixture, FloatArray]:
     """The fitted regression, and each candidate's residuals ``(N, D)`` about the way it goes."""
     rows, clocks = points.split(points.values), points.split(points.times)
@@ -129,7 +131,7 @@ def _fit_points(
     if estimator in NETWORKS:
         fit = StudentTNetwork(dof, NETWORKS[estimator], seed).fit(rows, clocks)
     else:
-        fit = StudentTRegression(dof, groups=alike).fit(rows, clocks)
+        fit = StudentTRegression(dof, groups=alike, bends=bends).fit(rows, clocks)
     return fit, np.concatenate(scaled_residuals(fit, points))
 
 

@@ -26,16 +26,16 @@ def choose_stiffness(model: PenalisedLikelihood, state: State) -> float:
     """
     if len(model.data) < 2 or not model.roughness.count:
         return 0.0
-    unit = np.sqrt(state.squared_scale)
+    unit, acceleration = np.sqrt(state.squared_scale), model.acceleration(state)
     normal, pulls = model.pulls(state)
     pulls = np.asfortranarray((pulls / unit).reshape(len(normal[0]), -1))
-    target = multiply_banded(normal, state.curve)
+    target = multiply_banded(normal + model.price_matrix(state.squared_scale, acceleration, 0.0), state.curve)
     smooth = state
     inflation = 2 * len(model.data) / (len(model.data) - 1)
     best, choice = np.inf, 0.0
-    for stiffness in (0.0, *STIFFNESSES * min(1.0, NEARLY_GAUSSIAN_DOF / model.dof) ** 2):
+    for stiffness in (0.0, *STIFFNESSES * smoothing_share(model.dof)):
         for _ in range(CORNER_SWEEPS):
-            bands = normal + model.price_matrix(model.acceleration(smooth), stiffness)
+            bands = normal + model.price_matrix(state.squared_scale, model.acceleration(smooth), stiffness)
             smooth = replace(smooth, curve=solve_banded(bands, target))
         moved = (smooth.curve - state.curve) / unit
         risk = (moved * multiply_banded(normal, moved)).sum()
@@ -43,3 +43,8 @@ def choose_stiffness(model: PenalisedLikelihood, state: State) -> float:
         if risk < best:
             best, choice = risk, stiffness
     return choice
+
+
+def smoothing_share(dof: float) -> float:
+    """How much of all smoothing is wanted: 1, but ever less where ν → ∞ is to be the mean of the candidates."""
+    return min(1.0, NEARLY_GAUSSIAN_DOF / dof) ** 2

@@ -29,7 +29,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression.alignment import Candidates, checked_dof, group_matrix
 from robust_instant_policy.regression.basis import BANDS, FAINT, HatBasis, Roughness, solve_banded
 from robust_instant_policy.regression.diagnosis import effective_count, error_freedom, small_sample_factor
-from robust_instant_policy.regression.smoothing import choose_stiffness
+from robust_instant_policy.regression.smoothing import choose_stiffness, smoothing_share
 from robust_instant_policy.regression.switching import persistent
 from robust_instant_policy.regression.uncertainty import squared_error
 
@@ -80,28 +80,42 @@ class StudentTRegression:
     whole), those of a whole "trajectory", or every "number" by itself, as in the paper's Eq. 1, with ``groups`` unused.
     ``groups (D,)`` are labels of the dimensions that share one scale, such as the coordinates of points, which makes
     the fit independent of the choice of axes; without it each dimension has its own.
+    ``bends (B,)``, evenly spread over time, say how sharply the true curve may be expected to turn: the standard
+    deviation of a coordinate's second difference between steps 1 / (B - 1) apart. Where candidates disagree the curve
+    then goes on as it came, where they agree it hardly matters. All dimensions must share one scale for that.
 
     After `fit`: ``knots (K,)``; ``weights``, Q arrays ``(T_q,)`` in [0, 1]; ``log_likelihood``, a value an iteration,
     never falling; ``converged`` and ``num_iterations``; ``stiffness``, the price on accelerations that was chosen.
     """
 
-    def __init__(self, dof: float = DEFAULT_DOF, unit: str = "step", groups: ArrayLike | None = None):
+    def __init__(
+        self,
+        dof: float = DEFAULT_DOF,
+        unit: str = "step",
+        groups: ArrayLike | None = None,
+        bends: ArrayLike | None = None,
+    ):
         if unit not in UNITS:
             raise UnknownNameError("unit", unit, UNITS)
         self.dof = checked_dof(dof)
         self.unit = unit
         self.groups = groups
+        self.bends = None if bends is None else _checked_bends(bends)
 
     def fit(self, candidates: Sequence[ArrayLike], times: Sequence[ArrayLike] | None = None) -> StudentTRegression:
         """Fit to ``candidates``, each ``(T_q, D)``, at ``times``, each ``(T_q,)`` in [0, 1] (evenly spread if None)."""
         data = Candidates.from_arrays(candidates, times)
         groups = group_matrix(self.groups, data.num_dimensions)
+        if self.bends is not None and self.unit != "number" and not groups.all():
+            raise InvalidValueError(f"bends need groups ({data.num_dimensions},) of one label: they are in one unit")
         if self.unit == "number":
             columns = np.arange(data.num_dimensions)[:, None]
             parts = [(replace(data, values=data.values[:, column]), column) for column in columns]
         else:
             parts = [(data, np.arange(data.num_dimensions))]
-        self._parts = [_fit(part, self.dof, self.unit, groups[np.ix_(column, column)]) for part, column in parts]
+        self._parts = [
+            _fit(part, self.dof, self.unit, groups[np.ix_(column, column)], self.bends) for part, column in parts
+        ]
         self.knots = data.grid()
         self.stiffness = float(np.mean([part.model.stiffness for part in self._parts]))
         self.num_iterations = max(len(part.trace) for part in self._parts)
@@ -175,8 +189,8 @@ class _Part(NamedTuple):
     trace: list[float]
 
 
-def _fit(data: Candidates, dof: float, unit: str, groups: FloatArray) -> _Part:
-    model = PenalisedLikelihood(data, dof, unit, groups)
+def _fit(data: Candidates, dof: float, unit: str, groups: FloatArray, bends: FloatArray | None) -> _Part:
+    model = PenalisedLikelihood(data, dof, unit, groups, bends)
     state = model.start()
     if np.isfinite(dof):
         for _ in range(DRAFT_ITERATIONS):
@@ -194,10 +208,16 @@ def _fit(data: Candidates, dof: float, unit: str, groups: FloatArray) -> _Part:
 class PenalisedLikelihood:
     """The penalised likelihood of one set of candidates."""
 
-    def __init__(self, data: Candidates, dof: float, unit: str, groups: FloatArray):
+    def __init__(self, data: Candidates, dof: float, unit: str, groups: FloatArray, bends: FloatArray | None = None):
         self.data, self.dof, self.unit, self.groups = data, dof, unit, groups
         self.basis = HatBasis(data)
         self.roughness = Roughness(self.basis.knots)
+        self.straightness = np.zeros(self.roughness.count)  # price on squared accelerations that is known beforehand
+        if bends is not None and self.roughness.count:
+            knots, known = self.basis.knots, np.linspace(0, 1, len(bends))
+            unit_of_bends = (np.diff(knots).mean() * (len(bends) - 1)) ** 2
+            self.straightness = (np.interp(knots[1:-1], known, bends) * unit_of_bends) ** -2.0
+            self.straightness *= smoothing_share(dof)
         self.trust = np.ones(len(data.values))
         self.stiffness = 0.0
         self.scale_is_free = True
@@ -256,7 +276,7 @@ class PenalisedLikelihood:
         shared = basis.gather(weights * _mean_square(squares, squared_scale))
         profile = (shared + PRIOR_SAMPLES) / (self._per_knot + PRIOR_SAMPLES)
         precision = weights / basis.spread(profile)
-        bands = basis.normal_matrix(precision) + self.price_matrix(acceleration, self.stiffness)
+        bands = basis.normal_matrix(precision) + self.price_matrix(squared_scale, acceleration, self.stiffness)
         curve = solve_banded(bands, basis.project(precision, values))
         return State(curve, squared_scale, profile), distance, acceleration
 
@@ -302,13 +322,17 @@ class PenalisedLikelihood:
             return np.zeros(0)
         return _mean_square(self.roughness(state.curve) ** 2, state.squared_scale)
 
-    def price_matrix(self, acceleration: FloatArray, stiffness: float) -> FloatArray:
-        """What accelerations cost, as lower bands ``(3, K)``: little where there already is a corner."""
+    def price_matrix(self, squared_scale: FloatArray, acceleration: FloatArray, stiffness: float) -> FloatArray:
+        """What accelerations cost, as lower bands ``(3, K)``: what is known beforehand, and ``stiffness``, little where
+        there already is a corner."""
         if not self.roughness.count:
             return np.zeros((BANDS, 1))
+        price = self.straightness * squared_scale.mean()
         if stiffness:
-            return self.roughness.matrix(stiffness * expected_precision(stiffness * acceleration, CORNER_DOF))
-        return self.roughness.matrix(np.full(self.roughness.count, 0.0 if self.basis.on_knots else FAINT))
+            price = price + stiffness * expected_precision(stiffness * acceleration, CORNER_DOF)
+        elif not self.basis.on_knots:
+            price = price + FAINT
+        return self.roughness.matrix(price)
 
     def _log_likelihood(self, distance: FloatArray, acceleration: FloatArray, state: State) -> float:
         """Log-likelihood of the candidates plus that of scales and accelerations under their priors."""
@@ -326,6 +350,7 @@ class PenalisedLikelihood:
             total -= 0.5 * dimension * (CORNER_DOF + 1) * np.log1p(self.stiffness * acceleration / CORNER_DOF).sum()
         elif not self.basis.on_knots:
             total -= 0.5 * dimension * FAINT * acceleration.sum()
+        total -= 0.5 * dimension * state.squared_scale.mean() * (self.straightness @ acceleration)
         return float(total)
 
 
@@ -333,3 +358,10 @@ def _mean_square(squares: FloatArray, squared_scale: FloatArray) -> FloatArray:
     """Mean over the dimensions ``(N,)`` of ``squares (N, D)`` in units of ``squared_scale (D,)``."""
     # einsum, because products this thin are slower on several cores than on one
     return np.einsum("nd,d->n", squares, 1 / (squared_scale * len(squared_scale)))
+
+
+def _checked_bends(bends: ArrayLike) -> FloatArray:
+    values = np.asarray(bends, dtype=np.float64)
+    if values.ndim != 1 or len(values) < 2 or not (np.isfinite(values).all() and (values > 0).all()):
+        raise InvalidValueError(f"bends must be (B,) with B >= 2, positive and finite, got shape {values.shape}")
+    return values

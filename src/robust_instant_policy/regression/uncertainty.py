@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.regression.basis import FAINT, solve_banded
+from robust_instant_policy.regression.basis import FAINT, multiply_banded, solve_banded
 from robust_instant_policy.regression.diagnosis import small_sample_factor
 
 if TYPE_CHECKING:
@@ -22,7 +22,8 @@ def squared_error(model: PenalisedLikelihood, state: State) -> tuple[FloatArray,
     """Expected squared error of the curve ``(K, D)``, and the number of candidates ``(K,)`` that decide it.
 
     The scatter of the candidates' pulls, each as a whole, so that errors that wander along a candidate count in
-    full; plus what smoothing moved the curve beyond what it took out of that scatter, its bias. A residual shows
+    full; plus what smoothing moved the curve beyond what it took out of that scatter, its bias (the smoothness that is
+    known beforehand has none). A residual shows
     less than the error: the mean of n candidates moves with each of them (n - 1) / n; and moves more than w says,
     because w falls with the residual: the curvature of the likelihood is w (1 - 2/p · δ² / (ν + δ²)).
     """
@@ -35,16 +36,21 @@ def squared_error(model: PenalisedLikelihood, state: State) -> tuple[FloatArray,
 
     normal, pulls = model.pulls(state)
     flat = pulls.reshape(len(pulls), -1)
-    bands = normal + model.price_matrix(model.acceleration(state), model.stiffness)
+    acceleration = model.acceleration(state)
+    bands = normal + model.price_matrix(state.squared_scale, acceleration, model.stiffness)
     smoothed = solve_banded(bands, flat).reshape(pulls.shape)
     error = inflation[:, None] * (smoothed**2).sum(axis=1)
     if model.stiffness:
-        faint = normal + model.roughness.matrix(np.full(model.roughness.count, FAINT))
+        known = model.price_matrix(state.squared_scale, acceleration, 0.0)
+        faint = normal + known + model.roughness.matrix(np.full(model.roughness.count, FAINT))
         unsmoothed = solve_banded(faint, flat).reshape(pulls.shape)
-        moved = solve_banded(faint, pulls.sum(axis=1)) ** 2
+        moved = solve_banded(faint, pulls.sum(axis=1) - multiply_banded(known, state.curve)) ** 2
         removed = inflation[:, None] * ((unsmoothed - smoothed) ** 2).sum(axis=1)
         error += np.maximum(_pooled((moved - removed) @ model.groups), 0.0)
     error = _pooled(error @ model.groups)
+    if model.straightness.any():  # where the curve goes on as expected nothing scatters, and yet it may be wrong
+        unsure = np.diag(solve_banded(bands, np.eye(len(bands[0]))))
+        error = np.maximum(error, unsure[:, None] * state.squared_scale)
     alone = deciding < ALONE
     error[alone] += (state.profile[:, None] * state.squared_scale)[alone]
     return error, deciding
