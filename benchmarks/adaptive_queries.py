@@ -44,6 +44,7 @@ class Sampled:
     candidates: Sequence[Trajectory]
     elsewhere: Sequence[Trajectory]
     tokens: Sequence[int]
+    bends: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ def sampled(scenes: int) -> list[Sampled]:
                 [prompt.trajectory(text, scene.keypoints) for text in texts],
                 [prompt.trajectory(text, demo.keypoints) for text, demo in zip(texts, demos, strict=False)],
                 costs,
+                prompt.bends_,
             )
         )
         print(f"scene {number + 1} of {scenes}", flush=True)
@@ -80,8 +82,8 @@ def sampled(scenes: int) -> list[Sampled]:
     return result
 
 
-def planned(scene: Scene, candidates: Sequence[Trajectory]) -> Planned:
-    robust = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=DOF)
+def planned(scene: Scene, candidates: Sequence[Trajectory], bends: np.ndarray) -> Planned:
+    robust = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=DOF, bends=bends)
     return Planned(key_error(Trajectory.from_actions(robust.actions), scene.trajectory), robust.confidence)
 
 
@@ -104,7 +106,9 @@ def made_up(scenes: int) -> list[Line]:
             for draw in range(DRAWS if share else 1):
                 wrong = np.random.default_rng([number, draw]).random(len(one.candidates)) < share
                 mixed = [e if w else c for c, e, w in zip(one.candidates, one.elsewhere, wrong, strict=True)]
-                plans = {count: planned(one.scene, mixed[:count]) for count in range(FIRST_QUERIES, MOST + 1)}
+                plans = {
+                    count: planned(one.scene, mixed[:count], one.bends) for count in range(FIRST_QUERIES, MOST + 1)
+                }
                 cases.append((one, plans))
 
         def line(asking: str, choose: Callable[[dict[int, Planned]], int], of=cases, share=share) -> Line:

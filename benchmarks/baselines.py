@@ -2,11 +2,14 @@
 
 rip eval --methods kat-dp --demos 200 --episodes 20 --out runs/proof    (and the like)
 python benchmarks/baselines.py runs/proof runs/five --checkpoints checkpoints --table docs/tables/baselines.md
+
+What trainings took is kept in `results/baselines/training.json`, so that checkpoints need not be.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import re
 from collections import defaultdict
 from contextlib import closing
@@ -17,6 +20,7 @@ from robust_instant_policy.evaluation import Episode, open_episodes, wilson_inte
 from robust_instant_policy.evaluation.episodes import EpisodeKey
 from robust_instant_policy.policies.diffusion import checkpoint
 
+KEPT = Path(__file__).parents[1] / "results" / "baselines" / "training.json"
 NAME = re.compile(r"(?P<method>kat-dp|dp)-(?P<task>.+)-(?P<demos>\d+)-[0-9a-f]+")
 
 
@@ -50,13 +54,14 @@ def main() -> None:
 
 
 def training_seconds(folder: Path) -> dict[tuple[str, str, int, int], float]:
-    """Of every finished checkpoint in ``folder``: method, task, demonstrations and steps to seconds."""
-    seconds = {}
+    """Of every finished checkpoint in ``folder`` or before: method, task, demonstrations and steps to seconds."""
+    seconds = {tuple(key): value for key, value in json.loads(KEPT.read_text())} if KEPT.exists() else {}
     for path in folder.glob("*.safetensors"):
         name = NAME.fullmatch(path.stem)
         if name:
             tensors, facts = checkpoint.load(path)
             seconds[name["method"], name["task"], int(name["demos"]), len(tensors["losses"])] = facts["seconds"]
+    KEPT.write_text("[\n" + ",\n".join(json.dumps([key, seconds[key]]) for key in sorted(seconds)) + "\n]\n")
     return seconds
 
 

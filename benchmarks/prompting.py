@@ -113,8 +113,8 @@ class Measurement:
             scene=number,
             cold=self._cold,
             single=(*single, *[float("inf")] * (NUM_SAMPLES - len(single))),
-            gaussian=agreed_error(candidates, scene, float("inf")),
-            robust=agreed_error(candidates, scene, DOF),
+            gaussian=agreed_error(candidates, scene, float("inf"), self._prompt.bends_),
+            robust=agreed_error(candidates, scene, DOF, self._prompt.bends_),
             refused=counts[False],
             answers=counts.total(),
             tokens=sum(one.prompt_tokens - one.cached_tokens + one.completion_tokens for one in every),
@@ -144,10 +144,10 @@ def fitted(demos: Sequence[Scene], frames: Frames, layout: Layout, order: Order)
     return prompt.fit(np.stack([demo.keypoints for demo in demos]), [demo.trajectory for demo in demos])
 
 
-def agreed_error(candidates: Sequence[Trajectory], scene: Scene, dof: float) -> float:
+def agreed_error(candidates: Sequence[Trajectory], scene: Scene, dof: float, bends: np.ndarray) -> float:
     if len(candidates) < MIN_CANDIDATES:
         return float("inf")
-    fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof)
+    fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof, bends=bends)
     return key_error(Trajectory.from_actions(fit.actions), scene.trajectory)
 
 
