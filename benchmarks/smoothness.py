@@ -1,0 +1,94 @@
+"""How sharply trajectories turn: demonstrations, single samples, their Gaussian mean, and robust trajectories that do
+and do not know how sharply the demonstrations turn.
+
+    python benchmarks/smoothness.py --samples results/paper/samples.sqlite --out docs/tables/smoothness.md
+
+The samples are those that `rip eval --suite table1` stored; no model is asked. A turn is the largest second difference
+of any of the gripper's points between one step and the next two.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+import robust_instant_policy as rip
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.llm import ReplayedModel, SampleStore, model_name
+from robust_instant_policy.policies import InstantPolicy
+from robust_instant_policy.policies.instant import Proposal
+from robust_instant_policy.policies.rip import robust_plan
+from robust_instant_policy.tasks import make_task
+from robust_instant_policy.trajectory import Trajectory
+
+TASKS = ("push-cube", "pick-banana", "open-drawer", "close-cabinet", "turn-faucet")
+FIRST_SEED = 100_000  # of the scenes of `rip eval`
+NUM_DEMOS, NUM_QUERIES = 10, 5
+COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, bends unknown", "robust")
+
+
+def sharpest_turn(trajectory: Trajectory) -> float:
+    """Metres, the largest second difference of any point of ``trajectory``."""
+    points = trajectory.triplets.reshape(len(trajectory), -1, 3)
+    return float(np.linalg.norm(np.diff(points, n=2, axis=0), axis=-1).max())
+
+
+def key_difference(one: Trajectory, other: Trajectory) -> float:
+    """Metres, the largest distance between the points of two trajectories at their first and last step and both sides
+    of every change of a gripper."""
+    changes = np.flatnonzero(np.abs(np.diff(one.gripper_state, axis=0)).max(axis=1) > 0)
+    steps = [0, len(one) - 1, *changes, *(changes + 1)]
+    return float(np.linalg.norm(one.triplets[steps] - other.triplets[steps], axis=-1).max())
+
+
+def turns(proposal: Proposal) -> tuple[list[float], float]:
+    """The sharpest turns in the order of `COLUMNS` but the first, and what knowing the bends moves at key steps."""
+    gaussian, free, robust = (
+        robust_plan(candidates, dof).trajectory
+        for candidates, dof in ((proposal, np.inf), (replace(proposal, bends=None), 1.5), (proposal, 1.5))
+    )
+    paths = (proposal.candidates[0], gaussian, free, robust)
+    return [sharpest_turn(path) for path in paths], key_difference(free, robust)
+
+
+def measured(task_name: str, data: Path, store: SampleStore, llm: str, scenes: int) -> list[str]:
+    """A line of the table."""
+    task = make_task(task_name)
+    demonstrations = rip.load_demonstrations(data / task_name, task=task_name, limit=NUM_DEMOS)
+    policy = InstantPolicy(ReplayedModel(store, model_name(llm)), workspace=task.workspace).fit(demonstrations)
+    shown = [sharpest_turn(trajectory) for trajectory in policy.context.trajectories_]
+    rows, moved = [], []
+    for seed in tqdm(range(FIRST_SEED, FIRST_SEED + scenes), desc=task_name):
+        row, difference = turns(policy.propose(task.reset(seed), NUM_QUERIES))
+        rows.append(row)
+        moved.append(difference)
+    task.close()
+    columns: list[FloatArray] = [np.array(shown), *np.array(rows).T]
+    cells = [f"{1000 * np.median(column):.0f} ({1000 * column.max():.0f})" for column in columns]
+    return [task_name, *cells, f"{1000 * np.median(moved):.1f} ({1000 * max(moved):.1f})"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--samples", type=Path, required=True, help="samples.sqlite of a run of rip eval")
+    parser.add_argument("--data", type=Path, default=Path("data"), help="where the demonstrations are")
+    parser.add_argument("--tasks", nargs="+", default=TASKS)
+    parser.add_argument("--llm", default="embedded", help="the model of that run")
+    parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    store = SampleStore(options.samples)
+    lines = [["task", *COLUMNS, "moved at key steps"], ["---"] * (2 + len(COLUMNS))]
+    lines += [measured(task, options.data, store, options.llm, options.scenes) for task in options.tasks]
+    body = "".join("| " + " | ".join(cells) + " |\n" for cells in lines)
+    tail = f"\nMillimetres, median (largest) over {options.scenes} scenes, and over {NUM_DEMOS} demonstrations.\n"
+    options.out.write_text(body + tail)
+    print(options.out.read_text())
+
+
+if __name__ == "__main__":
+    main()
