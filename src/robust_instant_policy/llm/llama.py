@@ -27,10 +27,10 @@ from robust_instant_policy.llm.gguf import read_header
 from robust_instant_policy.llm.model import NOBODY, Listener, Sampling, Tally, context_error
 from robust_instant_policy.query import Answer, Query
 
-SHORT_TOKENS = 1024  # prompts up to this long, with their answers, are run many at once
+SHORT_TOKENS = 2048  # prompts up to this long, with their answers, are run many at once: twenty demonstrations are
 SLOT_STEP_TOKENS, LONG_STEP_TOKENS = 256, 4096  # slots for short and long prompts come in multiples of these
-SHORT_SLOTS = 32  # over all cores; a plan has about thirty steps
-MAX_SERVERS = 8  # cores beyond this bring little to about thirty prompts
+SHORT_SLOTS = 24  # over all cores; a plan has about ten prompts an arm
+MAX_SERVERS = 8  # cores beyond this bring little to ten or twenty prompts
 PROGRESS_TOKENS = 128  # read between two looks at the deadline, and at Ctrl-C, by each prompt
 MAX_CONTEXT_TOKENS = 32_768  # bounds memory for models with a longer context
 
