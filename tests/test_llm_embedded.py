@@ -23,8 +23,8 @@ from robust_instant_policy.query import Query  # noqa: E402
 ROWS = "".join(f"{row} {row + 1} {row + 2}\n" for row in range(10, 60))
 
 
-def question(number: int) -> Query:
-    return Query(f"{number}\n{ROWS}{number}", 12, 'root ::= " " [0-9]{1,2} " " [0-9]{1,2} "\\n"', stop=("\n",))
+def question(number: int, rows: str = ROWS) -> Query:
+    return Query(f"{number}\n{rows}{number}", 12, 'root ::= " " [0-9]{1,2} " " [0-9]{1,2} "\\n"', stop=("\n",))
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +52,9 @@ def test_every_answer_keeps_the_grammar_and_samples_differ(embedded):
     assert len({tuple(text) for text in texts}) > 1
 
 
-def test_demonstrations_are_read_once_for_all_samples_and_later_plans(embedded):
-    queries = [question(number) for number in range(5, 9)]
+@pytest.mark.parametrize(("rows", "count"), [(ROWS, 4), (3 * ROWS, 2)], ids=["ten shown", "twenty shown"])
+def test_demonstrations_are_read_once_for_all_samples_and_later_plans(embedded, rows, count):
+    queries = [question(number, rows) for number in range(5, 5 + count)]
     embedded.sample(queries, Sampling(2, temperature=0.5))
     later = [Query(query.text + " 1", 12, query.grammar, stop=query.stop) for query in queries]
     answers = [answer for own in embedded.sample(later, Sampling(2, temperature=0.5)) for answer in own]
