@@ -206,6 +206,12 @@ def test_every_analysis_has_a_table_even_when_half_is_missing(name):
     assert table.html().count("<tr>") == len(table.rows) + 1
 
 
+def test_methods_stand_in_one_order_whichever_was_run_first():
+    suite = Suite("table1", ("push-cube",), (Variant("gp"), KAT, RIP), (0,))
+    rows = [episode(variant, 0, True) for variant in suite.variants]
+    assert [variant.method for variant in Summary(suite, rows).variants] == ["rip", "kat", "gp"]
+
+
 def test_a_run_remembers_its_suites_and_the_commands_that_made_it(tmp_path):
     one = Suite("table1", ("push-cube",), (RIP,), (1,))
     two = Suite("table1", ("turn-faucet",), (Variant("rip-gauss"),), (1, 2))

@@ -10,6 +10,7 @@ from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.statistics import mean_and_deviation, wilson_interval
 from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.policies import METHOD_NAMES
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,9 @@ class Summary:
             if row.variant in variants and row.scene in scenes:
                 self._rows[row.variant].append(row)
         self.rows: list[Episode] = [row for rows in self._rows.values() for row in rows]
-        self.variants: list[Variant] = [variant for variant, rows in self._rows.items() if rows]
+        known = [variant for variant, rows in self._rows.items() if rows]
+        # whatever the order in which they were asked for, run by run
+        self.variants: list[Variant] = sorted(known, key=lambda variant: METHOD_NAMES.index(variant.method))
         self.tasks: list[str] = [task for task in suite.tasks if any(row.scene.task == task for row in self.rows)]
 
     def rate(self, variant: Variant, task: str | None = None) -> Rate | None:

@@ -15,6 +15,7 @@ from robust_instant_policy.evaluation.manifest import Invocation
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test
 from robust_instant_policy.evaluation.summary import Rate, Summary, reference
 from robust_instant_policy.evaluation.variant import Variant
+from robust_instant_policy.policies import METHOD_NAMES
 
 NONE = "–"
 
@@ -148,7 +149,7 @@ def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> T
     """How the failed episodes of each method share out over the stages that lost them."""
     keys = {row.key for row in episodes}
     known = [failure for failure in failures if failure.key in keys]
-    methods = list(dict.fromkeys(row.variant.method for row in episodes))
+    methods = sorted({row.variant.method for row in episodes}, key=METHOD_NAMES.index)
     stages_met = [stage for stage in STAGES if any(failure.stage == stage for failure in known)]
     rows = []
     for method in methods:
