@@ -14,19 +14,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from pick_and_place import key_error
 from tqdm import tqdm
 
 import robust_instant_policy as rip
+from robust_instant_policy.evaluation.scenes import FIRST_TEST_SEED
+from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.llm import ReplayedModel, SampleStore, model_name
 from robust_instant_policy.policies import InstantPolicy
 from robust_instant_policy.policies.instant import Proposal
-from robust_instant_policy.policies.rip import robust_plan
+from robust_instant_policy.policies.rip import DOF, robust_plan
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.trajectory import Trajectory
 
-TASKS = ("push-cube", "pick-banana", "open-drawer", "close-cabinet", "turn-faucet")
-FIRST_SEED = 100_000  # of the scenes of `rip eval`
 NUM_DEMOS, NUM_QUERIES = 10, 5
 COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, bends unknown", "robust")
 
@@ -37,22 +38,14 @@ def sharpest_turn(trajectory: Trajectory) -> float:
     return float(np.linalg.norm(np.diff(points, n=2, axis=0), axis=-1).max())
 
 
-def key_difference(one: Trajectory, other: Trajectory) -> float:
-    """Metres, the largest distance between the points of two trajectories at their first and last step and both sides
-    of every change of a gripper."""
-    changes = np.flatnonzero(np.abs(np.diff(one.gripper_state, axis=0)).max(axis=1) > 0)
-    steps = [0, len(one) - 1, *changes, *(changes + 1)]
-    return float(np.linalg.norm(one.triplets[steps] - other.triplets[steps], axis=-1).max())
-
-
 def turns(proposal: Proposal) -> tuple[list[float], float]:
     """The sharpest turns in the order of `COLUMNS` but the first, and what knowing the bends moves at key steps."""
     gaussian, free, robust = (
         robust_plan(candidates, dof).trajectory
-        for candidates, dof in ((proposal, np.inf), (replace(proposal, bends=None), 1.5), (proposal, 1.5))
+        for candidates, dof in ((proposal, np.inf), (replace(proposal, bends=None), DOF), (proposal, DOF))
     )
     paths = (proposal.candidates[0], gaussian, free, robust)
-    return [sharpest_turn(path) for path in paths], key_difference(free, robust)
+    return [sharpest_turn(path) for path in paths], key_error(robust, free)
 
 
 def measured(task_name: str, data: Path, store: SampleStore, llm: str, scenes: int) -> list[str]:
@@ -62,7 +55,7 @@ def measured(task_name: str, data: Path, store: SampleStore, llm: str, scenes: i
     policy = InstantPolicy(ReplayedModel(store, model_name(llm)), workspace=task.workspace).fit(demonstrations)
     shown = [sharpest_turn(trajectory) for trajectory in policy.context.trajectories_]
     rows, moved = [], []
-    for seed in tqdm(range(FIRST_SEED, FIRST_SEED + scenes), desc=task_name):
+    for seed in tqdm(range(FIRST_TEST_SEED, FIRST_TEST_SEED + scenes), desc=task_name):
         row, difference = turns(policy.propose(task.reset(seed), NUM_QUERIES))
         rows.append(row)
         moved.append(difference)
@@ -76,7 +69,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--samples", type=Path, required=True, help="samples.sqlite of a run of rip eval")
     parser.add_argument("--data", type=Path, default=Path("data"), help="where the demonstrations are")
-    parser.add_argument("--tasks", nargs="+", default=TASKS)
+    parser.add_argument("--tasks", nargs="+", default=SIMULATION_TASKS)
     parser.add_argument("--llm", default="embedded", help="the model of that run")
     parser.add_argument("--scenes", type=int, default=20)
     parser.add_argument("--out", type=Path, required=True)

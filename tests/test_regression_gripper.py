@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from robust_instant_policy.context.alignment import align
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError
 from robust_instant_policy.geometry import GripperTriangle
 from robust_instant_policy.regression import robust_gripper_trajectory
 from robust_instant_policy.regression.gripper import steady_state
+from robust_instant_policy.trajectory import Trajectory
 from tests.regression_scenes import KINDS, draw_modes, draw_scene
 
 
@@ -127,3 +129,11 @@ def test_bad_arguments_are_refused():
         robust_gripper_trajectory(good, num_steps=0)
     with pytest.raises(InvalidValueError, match="dof"):
         robust_gripper_trajectory(good, dof=-1)
+
+
+def test_a_trajectory_of_one_step_has_no_bends_and_yet_a_plan():
+    step = GripperTriangle(length=0.1, opening=0.08).triplets(np.eye(4)[None]).reshape(1, 9)
+    actions = np.concatenate([step, [[1.0]]], axis=1)
+    bends = align([Trajectory.from_actions(actions)]).usual_bends()
+    fit = robust_gripper_trajectory([actions] * 3, bends=bends)
+    assert np.allclose(fit.actions, actions)

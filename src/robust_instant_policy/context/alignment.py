@@ -31,6 +31,23 @@ class AlignedDemonstrations:
     kept: tuple[int, ...]
     key_steps: tuple[int, ...]
 
+    def usual_bends(self) -> FloatArray:
+        """How sharply the gripper's points turn at each step.
+
+        The standard deviation ``(T,)``, metres, of a coordinate's second difference:
+        twice what was shown at that step and the ones before and after, because a new scene may need sharper turns, a
+        little earlier or later. Two values where there are fewer steps.
+        """
+        demos, steps = self.actions.shape[:2]
+        if steps < 3:
+            return np.full(2, LEAST_BEND_M)
+        arms = self.actions.reshape(demos, steps, -1, ACTION_DIM)
+        points = arms[..., :STATE_INDEX].reshape(demos, steps, -1, 3)
+        accelerations = np.diff(points, n=2, axis=1)
+        shown = np.sqrt((accelerations**2).mean(axis=-1).max(axis=-1).mean(axis=0))  # of the point that turns most
+        near = np.pad(shown, 2, mode="edge")
+        return np.maximum(BEND_SLACK * np.max([near[:-2], near[1:-1], near[2:]], axis=0), LEAST_BEND_M)
+
 
 def align(trajectories: Sequence[Trajectory]) -> AlignedDemonstrations:
     """Bring ``trajectories`` to a common number of steps, the median of each stretch's.
@@ -67,23 +84,6 @@ def align(trajectories: Sequence[Trajectory]) -> AlignedDemonstrations:
     starts = np.cumsum([0, *lengths])
     edges = {0, int(starts[-1]) - 1, *map(int, starts[1:-1]), *(int(start) - 1 for start in starts[1:-1])}
     return AlignedDemonstrations(actions, kept, tuple(sorted(edges)))
-
-
-def usual_bends(trajectories: Sequence[Trajectory]) -> FloatArray:
-    """How sharply the gripper's points turn in ``trajectories`` at each of the T steps that `align` makes of them.
-
-    The standard deviation ``(T,)``, metres, of a coordinate's second difference: twice what was shown at that step and
-    the ones before and after, because a new scene may need sharper turns, a little earlier or later.
-    """
-    actions = align(trajectories).actions
-    demos, steps = actions.shape[:2]
-    if steps < 3:
-        return np.full(steps, LEAST_BEND_M)
-    points = actions.reshape(demos, steps, -1, ACTION_DIM)[..., :STATE_INDEX].reshape(demos, steps, -1, 3)
-    accelerations = np.diff(points, n=2, axis=1)
-    shown = np.sqrt((accelerations**2).mean(axis=-1).max(axis=-1).mean(axis=0))  # of the point that turns most
-    near = np.pad(shown, 2, mode="edge")
-    return np.maximum(BEND_SLACK * np.max([near[:-2], near[1:-1], near[2:]], axis=0), LEAST_BEND_M)
 
 
 def _stretches(trajectory: Trajectory) -> list[tuple[tuple[int, ...], int, int]]:

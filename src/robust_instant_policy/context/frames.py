@@ -32,7 +32,7 @@ TILT_COST = 0.1  # of frames that agree equally, the one that stays upright
 DISTANCE_COST_PER_M = 4.0  # divided by the number of demonstrations: the fewer, the more it matters what is near
 WORLD_DISTANCE_M = 0.25  # the world frame counts as being this far away
 
-SHARES = tuple(np.arange(1, 8) / 8)  # of the way between two frames at which there is one more
+SHARES = tuple(eighths / 8 for eighths in range(1, 8))  # of the way between two frames at which there is one more
 MOST_OBJECTS = 3  # with ways between them and the world
 BETWEEN_COST = 0.1  # of frames that agree equally, one that is not on the way,
 BETWEEN_COST_OF_FEW = 1.0  # divided by the number of demonstrations: among few, some share of the way agrees by chance
@@ -117,15 +117,19 @@ def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArr
 def _between(first: FloatArray, second: FloatArray, share: float, turn: float) -> FloatArray:
     """The pose between two poses ``(..., 4, 4)`` whose axes differ by a turn about the vertical only."""
     relative = np.swapaxes(first[..., :3, :3], -1, -2) @ second[..., :3, :3]
-    angle = turn * np.arctan2(relative[..., 1, 0], relative[..., 0, 0])
-    turned = np.zeros_like(relative)
-    turned[..., 0, 0] = turned[..., 1, 1] = np.cos(angle)
-    turned[..., 1, 0], turned[..., 0, 1] = np.sin(angle), -np.sin(angle)
-    turned[..., 2, 2] = 1.0
-    pose = np.zeros_like(first)
-    pose[..., :3, :3] = first[..., :3, :3] @ turned
+    angle = np.asarray(turn * np.arctan2(relative[..., 1, 0], relative[..., 0, 0]))
+    pose = _turned(angle)
+    pose[..., :3, :3] = first[..., :3, :3] @ pose[..., :3, :3]
     pose[..., :3, 3] = (1 - share) * first[..., :3, 3] + share * second[..., :3, 3]
-    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def _turned(angle: FloatArray) -> FloatArray:
+    """Poses ``(..., 4, 4)`` at the origin, turned about the vertical."""
+    pose = np.zeros((*angle.shape, 4, 4))
+    pose[..., 0, 0] = pose[..., 1, 1] = np.cos(angle)
+    pose[..., 1, 0], pose[..., 0, 1] = np.sin(angle), -np.sin(angle)
+    pose[..., 2, 2] = pose[..., 3, 3] = 1.0
     return pose
 
 
@@ -141,11 +145,7 @@ def _fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) ->
     a, b = source - source_mean, target - target_mean
     sine = (share[..., 0] * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])).sum(axis=-1)
     cosine = (share[..., 0] * (a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1])).sum(axis=-1)
-    angle = np.arctan2(sine, cosine)
-    pose = np.zeros((*angle.shape, 4, 4))
-    pose[..., 0, 0] = pose[..., 1, 1] = np.cos(angle)
-    pose[..., 1, 0], pose[..., 0, 1] = np.sin(angle), -np.sin(angle)
-    pose[..., 2, 2] = pose[..., 3, 3] = 1.0
+    pose = _turned(np.arctan2(sine, cosine))
     pose[..., :3, 3] = target_mean[..., 0, :] - (pose[..., :3, :3] @ np.swapaxes(source_mean, -1, -2))[..., 0]
     return pose
 
@@ -182,9 +182,7 @@ def candidate_frames(keypoints: FloatArray) -> list[Frame]:
         for ends in combinations([WORLD, *_objects(frames)], 2):
             members = ends[0].members + ends[1].members
             for share in SHARES:
-                frames.extend(
-                    Frame("between", members, None, ends, float(share), float(turn)) for turn in (0.0, share, 1.0)
-                )
+                frames.extend(Frame("between", members, None, ends, share, turn) for turn in (0.0, share, 1.0))
     return frames
 
 

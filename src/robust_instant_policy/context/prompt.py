@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from robust_instant_policy.context.alignment import align, usual_bends
+from robust_instant_policy.context.alignment import align
 from robust_instant_policy.context.codec import (
     MM,
     millimetres,
@@ -71,7 +71,7 @@ class InContextPrompt:
     the cost that a model cannot go on from what it read for the last scene, as it can with ``"given"``.
 
     After `fit`, ``frames_`` lists for each arm the frame of each step, and ``bends_ (B,)``, metres, evenly spread over
-    the trajectories to come, says how sharply the demonstrations' gripper turns (see `usual_bends`).
+    the trajectories to come, says how sharply the gripper turns (see `AlignedDemonstrations.usual_bends`).
     """
 
     def __init__(self, frames: Frames = "adaptive", layout: Layout = "factorised", order: Order = "given"):
@@ -99,14 +99,15 @@ class InContextPrompt:
         self._num_arms = widths.pop() // ACTION_DIM
         if self.frames == "world" and self.layout == "sequence":
             # The paper's prompt: trajectories as they are, whatever their lengths and wherever the gripper changes.
-            self.bends_ = np.full(max(map(len, trajectories)), usual_bends(trajectories).max())
+            bends = align(trajectories).usual_bends()
+            self.bends_ = np.full_like(bends, bends.max())
             self._lengths = [len(trajectory) for trajectory in trajectories]
             self.frames_: list[list[Frame]] = [[WORLD] * max(self._lengths)] * self._num_arms
             self._keypoints = keypoints
             self._write_sequences([_world_rows(trajectory) for trajectory in trajectories])
             return self
         aligned = align(trajectories)
-        self.bends_ = usual_bends(trajectories)
+        self.bends_ = aligned.usual_bends()
         self._keypoints = keypoints[list(aligned.kept)]
         self._lengths = [aligned.actions.shape[1]]
         self._choose_frames(aligned.actions, aligned.key_steps)

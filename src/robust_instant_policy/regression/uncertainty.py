@@ -23,9 +23,9 @@ def squared_error(model: PenalisedLikelihood, state: State) -> tuple[FloatArray,
 
     The scatter of the candidates' pulls, each as a whole, so that errors that wander along a candidate count in
     full; plus what smoothing moved the curve beyond what it took out of that scatter, its bias (the smoothness that is
-    known beforehand has none). A residual shows
-    less than the error: the mean of n candidates moves with each of them (n - 1) / n; and moves more than w says,
-    because w falls with the residual: the curvature of the likelihood is w (1 - 2/p · δ² / (ν + δ²)).
+    known beforehand has none). A residual shows less than the error: the mean of n candidates moves with each of them
+    (n - 1) / n; and moves more than w says, because w falls with the residual: the curvature of the likelihood is
+    w (1 - 2/p · δ² / (ν + δ²)).
     """
     distance = model.distance(state)
     weights = model.weights(state)
