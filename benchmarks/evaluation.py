@@ -17,6 +17,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 # As the workers have it, or prompts differ in their last digits; before numpy is imported.
@@ -115,9 +116,10 @@ def _time_parts(bench: Workbench, spent: dict[str, float]) -> Callable[[], None]
 
 
 def _scaling(suite: Suite, setup: Setup, folder: Path) -> list[str]:
-    """The whole suite by one worker and by two, from the command to the last row and from the first row on."""
+    """The whole suite by one worker, by two, by two, by one, so that a machine that slows down treats both alike."""
     lines = ["| workers | executions | seconds | a minute, from the first row on |", "| --- | --- | --- | --- |"]
-    for workers in (1, 2):
+    rates: dict[int, list[float]] = {1: [], 2: []}
+    for turn, workers in enumerate((1, 2, 2, 1)):
         arrivals: list[float] = []
 
         def outcome(done: int, total: int, what: object, arrivals: list[float] = arrivals) -> None:
@@ -126,10 +128,11 @@ def _scaling(suite: Suite, setup: Setup, folder: Path) -> list[str]:
 
         start = time.perf_counter()
         progress = Progress(lambda *_: None, outcome)
-        run_suites([suite], setup, folder / f"workers-{workers}", Processes(workers), progress)
-        rate = 60 * (len(arrivals) - 1) / (arrivals[-1] - arrivals[0])
-        lines.append(f"| {workers} | {len(arrivals)} | {arrivals[-1] - start:.0f} | {rate:.0f} |")
-    return lines
+        run_suites([suite], setup, folder / f"turn-{turn}", Processes(workers), progress)
+        rates[workers].append(60 * (len(arrivals) - 1) / (arrivals[-1] - arrivals[0]))
+        lines.append(f"| {workers} | {len(arrivals)} | {arrivals[-1] - start:.0f} | {rates[workers][-1]:.0f} |")
+    ratio = mean(rates[2]) / mean(rates[1])
+    return [*lines, "", f"Two workers execute {ratio:.2f} times as much in a minute as one."]
 
 
 if __name__ == "__main__":
