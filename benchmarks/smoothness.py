@@ -15,20 +15,14 @@ from pathlib import Path
 
 import numpy as np
 from pick_and_place import key_error
-from tqdm import tqdm
+from stored_proposals import NUM_DEMOS, proposals
 
-import robust_instant_policy as rip
-from robust_instant_policy.evaluation.scenes import FIRST_TEST_SEED
 from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.llm import ReplayedModel, SampleStore, model_name
-from robust_instant_policy.policies import InstantPolicy
 from robust_instant_policy.policies.instant import Proposal
 from robust_instant_policy.policies.rip import DOF, robust_plan
-from robust_instant_policy.tasks import make_task
 from robust_instant_policy.trajectory import Trajectory
 
-NUM_DEMOS, NUM_QUERIES = 10, 5
 COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, bends unknown", "robust")
 
 
@@ -48,18 +42,14 @@ def turns(proposal: Proposal) -> tuple[list[float], float]:
     return [sharpest_turn(path) for path in paths], key_error(robust, free)
 
 
-def measured(task_name: str, data: Path, store: SampleStore, llm: str, scenes: int) -> list[str]:
+def measured(task_name: str, data: Path, samples: Path, llm: str, scenes: int) -> list[str]:
     """A line of the table."""
-    task = make_task(task_name)
-    demonstrations = rip.load_demonstrations(data / task_name, task=task_name, limit=NUM_DEMOS)
-    policy = InstantPolicy(ReplayedModel(store, model_name(llm)), workspace=task.workspace).fit(demonstrations)
-    shown = [sharpest_turn(trajectory) for trajectory in policy.context.trajectories_]
     rows, moved = [], []
-    for seed in tqdm(range(FIRST_TEST_SEED, FIRST_TEST_SEED + scenes), desc=task_name):
-        row, difference = turns(policy.propose(task.reset(seed), NUM_QUERIES))
+    for _, policy, proposal in proposals(task_name, data, samples, llm, scenes):
+        row, difference = turns(proposal)
         rows.append(row)
         moved.append(difference)
-    task.close()
+        shown = [sharpest_turn(trajectory) for trajectory in policy.context.trajectories_]
     columns: list[FloatArray] = [np.array(shown), *np.array(rows).T]
     cells = [f"{1000 * np.median(column):.0f} ({1000 * column.max():.0f})" for column in columns]
     return [task_name, *cells, f"{1000 * np.median(moved):.1f} ({1000 * max(moved):.1f})"]
@@ -74,9 +64,8 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=20)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    store = SampleStore(options.samples)
     lines = [["task", *COLUMNS, "moved at key steps"], ["---"] * (2 + len(COLUMNS))]
-    lines += [measured(task, options.data, store, options.llm, options.scenes) for task in options.tasks]
+    lines += [measured(task, options.data, options.samples, options.llm, options.scenes) for task in options.tasks]
     body = "".join("| " + " | ".join(cells) + " |\n" for cells in lines)
     tail = f"\nMillimetres, median (largest) over {options.scenes} scenes, and over {NUM_DEMOS} demonstrations.\n"
     options.out.write_text(body + tail)

@@ -192,6 +192,23 @@ def test_bends_are_those_of_the_demonstrations_whatever_their_number():
     )
 
 
+def test_variation_is_that_of_the_demonstrations_in_the_frames_that_suit_them():
+    keypoints, trajectories = demonstrations()
+    variation = InContextPrompt().fit(keypoints, trajectories).variation_
+    assert variation.shape == (24,)
+    assert variation[[11, 23]].max() < 0.004  # at both objects, wherever they are
+    moved = []
+    for index, trajectory in enumerate(trajectories):
+        poses = TRIANGLE.poses(trajectory.triplets)
+        poses[17, ..., 2, 3] += 0.03 * (-1) ** index
+        moved.append(Trajectory.from_poses(poses[:, 0], trajectory.gripper_state[:, 0], TRIANGLE))
+    vertical = InContextPrompt().fit(keypoints, moved).variation_[17] ** 2 - variation[17] ** 2
+    assert np.sqrt(vertical) == pytest.approx(0.03 * np.sqrt(8 / 7 / 3), rel=0.1)  # of three coordinates one
+    assert InContextPrompt("world", "factorised").fit(keypoints, trajectories).variation_ is None
+    assert InContextPrompt("world", "sequence").fit(keypoints, trajectories).variation_ is None
+    assert InContextPrompt().fit(*demonstrations(1)).variation_ is None
+
+
 def test_one_demonstration_is_enough_to_follow_an_object():
     keypoints, trajectories = demonstrations(1)
     prompt = InContextPrompt().fit(keypoints, trajectories)

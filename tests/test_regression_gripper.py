@@ -137,3 +137,26 @@ def test_a_trajectory_of_one_step_has_no_bends_and_yet_a_plan():
     bends = align([Trajectory.from_actions(actions)]).usual_bends()
     fit = robust_gripper_trajectory([actions] * 3, bends=bends)
     assert np.allclose(fit.actions, actions)
+
+
+@pytest.mark.parametrize("estimator", ["em", "mixture"])
+def test_a_candidate_that_strays_less_than_demonstrations_differ_is_not_called_hallucinated(estimator):
+    scene = draw_scene(0, "smooth", 6, 0)
+    free, far = scene.candidates[1].copy(), scene.candidates[4].copy()
+    free[4:10, :9] += 0.02
+    far[20:26, :9] += 0.02
+    candidates = [scene.candidates[0], free, *scene.candidates[2:4], far, scene.candidates[5]]
+    variation = np.where(np.arange(30) < 15, 0.04, 0.002)  # a free way first, then a grasp
+    known, unknown = (
+        robust_gripper_trajectory(candidates, estimator=estimator, variation=v) for v in (variation, None)
+    )
+    assert np.flatnonzero(unknown.hallucinated).tolist() == [1, 4]
+    assert np.flatnonzero(known.hallucinated).tolist() == [4]
+    assert (known.actions == unknown.actions).all()
+    assert known.confidence == unknown.confidence
+
+
+@pytest.mark.parametrize("variation", [[], [[0.01]], [0.01, -0.01], [0.01, np.nan]])
+def test_a_variation_that_says_nothing_is_refused(variation):
+    with pytest.raises(InvalidValueError, match=r"variation must be \(V,\)"):
+        robust_gripper_trajectory(draw_scene(0, "smooth", 3, 0).candidates, variation=variation)

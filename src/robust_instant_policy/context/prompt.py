@@ -70,8 +70,10 @@ class InContextPrompt:
     ``order="nearest-last"`` puts the demonstrations whose keypoints lie nearest to the new scene's at the end, at
     the cost that a model cannot go on from what it read for the last scene, as it can with ``"given"``.
 
-    After `fit`, ``frames_`` lists for each arm the frame of each step, and ``bends_ (B,)``, metres, evenly spread over
-    the trajectories to come, says how sharply the gripper turns (see `AlignedDemonstrations.usual_bends`).
+    After `fit`, ``frames_`` lists for each arm the frame of each step. Evenly spread over the trajectories to come,
+    ``bends_ (B,)``, metres, says how sharply the gripper turns (see `AlignedDemonstrations.usual_bends`), and
+    ``variation_ (B,)``, metres, how far the demonstrations differ in those frames, as the standard deviation of a
+    point's coordinate; None in the world's frame, where they differ as the scenes do, and of a single demonstration.
     """
 
     def __init__(self, frames: Frames = "adaptive", layout: Layout = "factorised", order: Order = "given"):
@@ -101,6 +103,7 @@ class InContextPrompt:
             # The paper's prompt: trajectories as they are, whatever their lengths and wherever the gripper changes.
             bends = align(trajectories).usual_bends()
             self.bends_ = np.full_like(bends, bends.max())
+            self.variation_: FloatArray | None = None
             self._lengths = [len(trajectory) for trajectory in trajectories]
             self.frames_: list[list[Frame]] = [[WORLD] * max(self._lengths)] * self._num_arms
             self._keypoints = keypoints
@@ -113,6 +116,7 @@ class InContextPrompt:
         self._choose_frames(aligned.actions, aligned.key_steps)
         pairs = list(zip(self._keypoints, aligned.actions, strict=True))
         numbers = np.stack([self._encode(points, actions) for points, actions in pairs])
+        self.variation_ = self._variation(numbers) if self.frames == "adaptive" and len(numbers) > 1 else None
         if self.layout == "sequence":
             self._write_sequences(list(np.round(numbers)))
         else:
@@ -274,10 +278,13 @@ class InContextPrompt:
         rows = numbers.reshape(len(numbers), self._num_arms, ACTION_DIM).copy()
         for poses, row in zip(self._poses(keypoints), rows, strict=False):
             for pose, arm in zip(poses, row, strict=True):
-                centre, palm, left = arm[:STATE_INDEX].reshape(3, 3) / MM
-                points = np.stack([centre + palm, centre + left, centre - left])
-                arm[:STATE_INDEX] = transform_points(pose, points).ravel()
+                arm[:STATE_INDEX] = transform_points(pose, _points(arm / MM)).ravel()
         return rows.reshape(len(numbers), -1)
+
+    def _variation(self, numbers: FloatArray) -> FloatArray:
+        """Metres ``(T,)``, from the numbers of all demonstrations ``(I, T, 10·A)``."""
+        points = _points(numbers.reshape(*numbers.shape[:2], self._num_arms, ACTION_DIM))
+        return np.sqrt(points.var(axis=0, ddof=1).mean(axis=(1, 2, 3))) / MM
 
     def _inputs(self, keypoints: FloatArray) -> FloatArray:
         """The keypoints in the frame of each step and arm, in millimetres ``(T, A, 3·K)``."""
@@ -353,6 +360,12 @@ def _shown(inputs: FloatArray, chosen: Sequence[int]) -> str:
 
 def _sequence_input(keypoints: FloatArray) -> str:
     return write_row(millimetres(keypoints).ravel()) + "\n"
+
+
+def _points(numbers: FloatArray) -> FloatArray:
+    """Palm and fingertips ``(..., 3, 3)`` in a frame, from an arm's numbers ``(..., 10)`` in it."""
+    centre, palm, left = np.moveaxis(numbers[..., :STATE_INDEX].reshape(*numbers.shape[:-1], 3, 3), -2, 0)
+    return np.stack([centre + palm, centre + left, centre - left], axis=-2)
 
 
 def _world_rows(trajectory: Trajectory) -> np.ndarray:

@@ -30,7 +30,8 @@ QUOTED_ANSWER_CHARS = 160
 class Proposal:
     """What the instant policy saw and proposed for one observation.
 
-    ``bends (B,)``, metres, say how sharply the demonstrations' gripper turns along the way, if that is known.
+    ``bends (B,)``, metres, say how sharply the demonstrations' gripper turns along the way, and ``variation (B,)``,
+    metres, how far they differ in the frames that suit them, where that is known.
     """
 
     located: Located
@@ -38,6 +39,7 @@ class Proposal:
     usage: Usage
     notes: tuple[str, ...]
     bends: FloatArray | None = None
+    variation: FloatArray | None = None
 
 
 class InstantPolicy:
@@ -120,7 +122,7 @@ class InstantPolicy:
         if count < num_queries:
             notes = (*notes, f"{count} of {num_queries} answers were usable in time")
         usage = Usage((heard.locating, _sampling(heard, answers)))
-        return Proposal(heard.located, candidates, usage, notes, self.prompt.bends_)
+        return Proposal(heard.located, candidates, usage, notes, self.prompt.bends_, self.prompt.variation_)
 
     def _ask(self, heard: _Heard, num_queries: int) -> None:
         """Sample what ``heard`` lacks of ``num_queries`` answers a query."""

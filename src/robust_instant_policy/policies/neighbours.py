@@ -41,7 +41,8 @@ class Neighbours:
             candidates = self._frames.carried_over(located.keypoints, self.num_queries)
         notes = (*self.context.extractor.notes_, *located.notes)
         usage = Usage((locating, *watch.stages))
-        return robust_plan(Proposal(located, candidates, usage, notes, self._frames.bends_))
+        frames = self._frames
+        return robust_plan(Proposal(located, candidates, usage, notes, frames.bends_, frames.variation_))
 
     def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
         """The robust trajectory alone."""

@@ -73,6 +73,7 @@ def robust_plan(proposal: Proposal, dof: float = DOF, estimator: str = "em", see
             estimator=estimator,
             seed=seed,
             bends=proposal.bends,
+            variation=proposal.variation,
         )
     return replace(
         plan_of_first_candidate(proposal),

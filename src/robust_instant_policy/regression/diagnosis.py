@@ -4,6 +4,9 @@ The paper leaves recognising hallucinations to future work (Oh et al. 2025, Sec.
 candidate, in scales of what trustworthy candidates show, are summed along it and the sum starts again whenever it
 would fall below zero (the cumulative sum of Page 1954). A wrong digit and a slow drift both drive it up, noise does
 not, and the step at which it last left zero is where the hallucination began.
+
+Where demonstrations differ from each other, as they do on a free way, candidates may differ as well: a scale is never
+taken for less than half of what demonstrations vary.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ CLEAN_SQUARE = 3.0  # mean squared residual, in scales, that noise does not exce
 SINGLE_SHARE = 1 / 8  # of a single number's squared residual that counts like the mean of all: a wrong digit is one
 FLAG_SCORE = 15.0  # excess over CLEAN_SQUARE, summed along a stretch, from which a candidate counts as hallucinated
 DIMENSION_SHARE = 0.2  # of the worst dimension's squared residual: dimensions above it are named with it
+VARIATION_SHARE = 0.5  # of what demonstrations vary: a candidate knows the scene (docs/tables/naming.md)
 TIMING_SLACK = 0.5  # steps early or late that are nobody's hallucination
 MAJORITY = 0.5  # share of the candidates that must agree before their agreement counts in full
 FREEDOM_PER_CANDIDATE = (
@@ -62,9 +66,15 @@ def diagnose(fit: Fit, candidates: Sequence[ArrayLike], times: Sequence[ArrayLik
     return judge(scaled_residuals(fit, Candidates.from_arrays(candidates, times)))
 
 
-def scaled_residuals(fit: Fit, data: Candidates) -> list[FloatArray]:
-    """Candidates less the robust trajectory ``(T_q, D)``, over the scale, each step compared at its best timing."""
+def scaled_residuals(fit: Fit, data: Candidates, variation: FloatArray | None = None) -> list[FloatArray]:
+    """Candidates less the robust trajectory ``(T_q, D)``, over the scale, each step compared at its best timing.
+
+    ``variation (B,)``, evenly spread over [0, 1], is the standard deviation of demonstrations, where it is known.
+    """
     scale = fit.scale(data.times)
+    if variation is not None:
+        habit = np.interp(data.times, np.linspace(0.0, 1.0, len(variation)), variation)
+        scale = np.hypot(scale, VARIATION_SHARE * habit[:, None])
     slack = TIMING_SLACK / max(float(np.median(data.lengths)) - 1, 1)
     choices = np.stack(
         [(data.values - fit.mean(np.clip(data.times + shift, 0, 1))) / scale for shift in (0.0, -slack, slack)]

@@ -58,6 +58,7 @@ def robust_gripper_trajectory(
     triangle: GripperTriangle | None = None,
     tolerance: float = TOLERANCE_M,
     bends: ArrayLike | None = None,
+    variation: ArrayLike | None = None,
 ) -> RobustTrajectory:
     """The robust gripper trajectory of ``candidates``, each ``(T_q, 10·A)``: palm, two fingertips (m), state, per arm.
 
@@ -67,7 +68,9 @@ def robust_gripper_trajectory(
     within [0, 1], evenly spread by default; the result has ``num_steps`` steps, by default the median of the
     candidates'. ``triangle`` is the gripper, by default measured from the candidates. ``seed`` is the network's.
     ``tolerance``, metres, is what `RobustTrajectory.confidence` is about. ``bends (B,)``, metres, say how sharply such
-    a gripper's points turn (see `StudentTRegression`); only "em" asks for them.
+    a gripper's points turn (see `StudentTRegression`); only "em" asks for them. ``variation (V,)``, metres and evenly
+    spread over time as well, is how far demonstrations differ along the way (see `InContextPrompt`): who strays by less
+    is not called hallucinated. The trajectory does not depend on it.
     """
     if estimator not in ESTIMATORS:
         raise UnknownNameError("estimator", estimator, ESTIMATORS)
@@ -82,7 +85,7 @@ def robust_gripper_trajectory(
     at = np.linspace(0.0, 1.0, count)
     is_state = np.arange(data.num_dimensions) % ARM_DIM == POINT_DIM
     points = Candidates(data.values[:, ~is_state], data.times, data.starts)
-    fit, residuals = _fit_points(points, dof, estimator, seed, bends)
+    fit, residuals = _fit_points(points, dof, estimator, seed, bends, _checked(variation))
     clocks = data.split(data.times)
     weights = np.stack([np.interp(at, clock, weight) for clock, weight in zip(clocks, fit.weights, strict=True)])
 
@@ -117,7 +120,12 @@ def robust_gripper_trajectory(
 
 
 def _fit_points(
-    points: Candidates, dof: float, estimator: str, seed: int, bends: ArrayLike | None
+    points: Candidates,
+    dof: float,
+    estimator: str,
+    seed: int,
+    bends: ArrayLike | None,
+    variation: FloatArray | None,
 ) -> tuple[StudentTRegression | StudentTNetwork | StudentTMixture, FloatArray]:
     """The fitted regression, and each candidate's residuals ``(N, D)`` about the way it goes."""
     rows, clocks = points.split(points.values), points.split(points.times)
@@ -125,14 +133,23 @@ def _fit_points(
     if estimator == "mixture":
         mixture = StudentTMixture(dof, groups=alike).fit(rows, clocks)
         own = np.maximum(mixture.labels, 0)[points.owners]
-        by_mode = [np.concatenate(scaled_residuals(mode, points)) for mode in mixture.modes]
+        by_mode = [np.concatenate(scaled_residuals(mode, points, variation)) for mode in mixture.modes]
         return mixture, np.stack(by_mode)[own, np.arange(len(own))]
     fit: StudentTRegression | StudentTNetwork
     if estimator in NETWORKS:
         fit = StudentTNetwork(dof, NETWORKS[estimator], seed).fit(rows, clocks)
     else:
         fit = StudentTRegression(dof, groups=alike, bends=bends).fit(rows, clocks)
-    return fit, np.concatenate(scaled_residuals(fit, points))
+    return fit, np.concatenate(scaled_residuals(fit, points, variation))
+
+
+def _checked(variation: ArrayLike | None) -> FloatArray | None:
+    if variation is None:
+        return None
+    values = np.asarray(variation, dtype=np.float64)
+    if values.ndim != 1 or not len(values) or not (np.isfinite(values) & (values >= 0)).all():
+        raise InvalidValueError(f"variation must be (V,), finite and not negative, got {values}")
+    return values
 
 
 def steady_state(votes: np.ndarray, weights: FloatArray) -> np.ndarray:

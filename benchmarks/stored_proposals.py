@@ -1,0 +1,30 @@
+"""What a language model proposed in the scenes of a run of `rip eval`, from its stored samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from tqdm import tqdm
+
+import robust_instant_policy as rip
+from robust_instant_policy.evaluation.scenes import FIRST_TEST_SEED
+from robust_instant_policy.llm import ReplayedModel, SampleStore, model_name
+from robust_instant_policy.policies import InstantPolicy
+from robust_instant_policy.policies.instant import Proposal
+from robust_instant_policy.tasks import make_task
+
+NUM_DEMOS, NUM_QUERIES = 10, 5
+
+
+def proposals(
+    task_name: str, data: Path, samples: Path, llm: str, scenes: int
+) -> Iterator[tuple[int, InstantPolicy, Proposal]]:
+    """Each scene's seed, the policy, and what it proposes there."""
+    task = make_task(task_name)
+    demonstrations = rip.load_demonstrations(data / task_name, task=task_name, limit=NUM_DEMOS)
+    model = ReplayedModel(SampleStore(samples), model_name(llm))
+    policy = InstantPolicy(model, workspace=task.workspace).fit(demonstrations)
+    for seed in tqdm(range(FIRST_TEST_SEED, FIRST_TEST_SEED + scenes), desc=task_name):
+        yield seed, policy, policy.propose(task.reset(seed), NUM_QUERIES)
+    task.close()
