@@ -225,3 +225,15 @@ def test_the_command_trains_what_an_evaluation_then_finds(workbench, demonstrati
     make_policy("kat-dp", instant, training=Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
     assert main([*command, "--method", "rip", "--out", str(tmp_path)]) == 2
     assert "known: dp, kat-dp" in capsys.readouterr().err
+
+
+def test_the_report_of_an_evaluation_shows_what_was_learned(workbench, demonstrations, tmp_path, monkeypatch):
+    monkeypatch.chdir(workbench)  # where data/push-cube is
+    command = ["eval", "--tasks", "push-cube", "--methods", "kat-dp", "--steps", "5", "--episodes", "1", "--no-videos"]
+    places = ["--checkpoints", str(tmp_path), "--out", str(tmp_path / "run")]
+    assert main([*command, "--demos", str(len(demonstrations)), *places]) == 0
+    (picture,) = (tmp_path / "run" / "training").glob("push-cube-kat-dp-*-5steps.svg")
+    assert "demonstration 2" in picture.read_text()
+    page = (tmp_path / "run" / "index.html").read_text()
+    assert page.count("<h2 id=training>") == page.count("href='#training'") == 1
+    assert picture.stem in page

@@ -20,6 +20,8 @@ from robust_instant_policy.policies import IMAGE_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.tasks import make_task
 
+TRAINING_FOLDER = "training"
+
 Plan = tuple[Scene, Variant]
 
 
@@ -51,7 +53,7 @@ def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, p
         if not works:
             return
         _record_missing(works, setup, progress)
-        _train_missing(works, setup, progress)
+        _train_missing(works, setup, out, progress)
         for outcome in hands(setup, works):
             if isinstance(outcome, Episode):
                 episodes.add(outcome)
@@ -100,6 +102,11 @@ def executions_left(rows: Iterable[Episode]) -> dict[Plan, int]:
 def plan_file(scene: Scene, variant: Variant) -> str:
     """Where, in a run's folder, a plan is kept that is to be drawn."""
     return f"plans/{scene}-{variant}.json"
+
+
+def training_file(task: str, variant: Variant) -> str:
+    """Where, in a run's folder, a picture is kept of how a method learned ``task``."""
+    return f"{TRAINING_FOLDER}/{task}-{variant}.svg"
 
 
 def missing_work(
@@ -159,8 +166,8 @@ def _record_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress
             task.close()
 
 
-def _train_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:
-    """Have checkpoints of everything that is trained, before workers would all train it at once."""
+def _train_missing(works: Sequence[SceneWork], setup: Setup, out: Path, progress: Progress) -> None:
+    """Have checkpoints of everything that is trained, before workers would all train it at once, and pictures of it."""
     trained: dict[tuple[str, Variant], SceneWork] = {}
     for work in works:
         for variant in work.concerned:
@@ -169,5 +176,11 @@ def _train_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress)
     if not trained:
         return
     with closing(Workbench(setup, report=progress.training)) as bench:
-        for (_, variant), work in trained.items():
-            bench.fit(work, variant)
+        for (task, variant), work in trained.items():
+            policy = bench.train(work, variant)
+            from robust_instant_policy.policies.diffusion.picture import training_picture  # now that PyTorch is there
+
+            picture = out / training_file(task, variant)
+            if not picture.exists():
+                picture.parent.mkdir(exist_ok=True)
+                write_whole(picture, training_picture(policy))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +31,9 @@ CAPTIONS = {
     "downsampling": "RIP on tasks with gripper actions. Whiskers: Wilson's 95% interval.",
     "trajectories": "The palm over time in the scene in which RIP and the Gaussian average part the most.",
 }
+TRAINING_CAPTION = (
+    "How the loss of each trained method fell, and what it samples where demonstrations say what is right."
+)
 STAGE_WORDS = {
     "execution": "execution: even the demonstrator's own trajectory fails when it is played back",
     "keypoints": "keypoints: with the true ones the method succeeds",
@@ -74,16 +77,22 @@ class Section:
 def write_page(
     folder: Path,
     sections: Sequence[Section],
+    trainings: Mapping[str, bytes],
     episodes: Sequence[Episode],
     failures: Iterable[Failure],
     failure_table: Table,
     invocations: Table,
 ) -> str:
-    """The page as text; films of failed episodes are taken from ``folder``."""
+    """The page as text; films of failed episodes are taken from ``folder``.
+
+    ``trainings`` are pictures, as SVG, of what trained methods learned.
+    """
     lost = [row for row in episodes if not row.success]
     tasks = list(dict.fromkeys(row.scene.task for row in episodes))
     methods = list(dict.fromkeys(row.variant.method for row in episodes))
     links = "".join(f'<a href="#{section.anchor}">{html.escape(section.title)}</a>' for section in sections)
+    if trainings:
+        links += "<a href='#training'>What was learned</a>"
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
         f"<title>Evaluation: {html.escape(', '.join(tasks))}</title><style>{STYLE}</style>",
@@ -92,6 +101,7 @@ def write_page(
         f"{len({row.scene for row in episodes})} scenes of {html.escape(', '.join(tasks))}; {len(lost):,} failed.</p>",
         f"<nav>{links}<a href='#failures'>What failed, and why</a><a href='#run'>What was run</a></nav>",
         *(_section(section) for section in sections),
+        _trainings(trainings),
         "<h2 id=failures>What failed, and why</h2>",
         failure_table.html(),
         _gallery(folder, lost, {failure.key: failure for failure in failures}),
@@ -103,12 +113,23 @@ def write_page(
 
 
 def _section(section: Section) -> str:
-    image = base64.b64encode(section.figure).decode()
     tables = "".join(table.html() for table in section.tables)
+    picture = _picture(section.title, section.figure, CAPTIONS[section.name])
+    return f"<h2 id={section.anchor}>{html.escape(section.title)}</h2>{picture}{tables}"
+
+
+def _trainings(pictures: Mapping[str, bytes]) -> str:
+    if not pictures:
+        return ""
+    shown = "".join(_picture(name, picture, name) for name, picture in pictures.items())
+    return f"<h2 id=training>What was learned</h2><p class=note>{TRAINING_CAPTION}</p>{shown}"
+
+
+def _picture(title: str, svg: bytes, caption: str) -> str:
+    image = base64.b64encode(svg).decode()
     return (
-        f"<h2 id={section.anchor}>{html.escape(section.title)}</h2>"
-        f'<figure><img alt="{html.escape(section.title)}" src="data:image/svg+xml;base64,{image}">'
-        f"<figcaption>{html.escape(CAPTIONS[section.name])}</figcaption></figure>{tables}"
+        f'<figure><img alt="{html.escape(title)}" src="data:image/svg+xml;base64,{image}">'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
     )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from robust_instant_policy.datasets.files import write_whole
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.episodes import open_episodes
-from robust_instant_policy.evaluation.experiment import plan_file, wanted_plans
+from robust_instant_policy.evaluation.experiment import TRAINING_FOLDER, plan_file, wanted_plans
 from robust_instant_policy.evaluation.failures import open_failures
 from robust_instant_policy.evaluation.figures import draw, encode
 from robust_instant_policy.evaluation.manifest import Manifest
@@ -52,7 +52,8 @@ def publish(out: Path) -> str:
     write_whole(out / TABLE_FILE, text.encode())
     invocations = invocation_table(manifest.invocations, rows)
     write_whole(out / RUN_TABLE_FILE, invocations.markdown().encode())
-    page = write_page(out, sections, rows, failures, lost, invocations)
+    trainings = {path.stem: path.read_bytes() for path in sorted((out / TRAINING_FOLDER).glob("*.svg"))}
+    page = write_page(out, sections, trainings, rows, failures, lost, invocations)
     write_whole(out / PAGE_FILE, page.encode())
     return text
 
