@@ -9,15 +9,14 @@ of any of the gripper's points between one step and the next two.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from pick_and_place import key_error
-from stored_proposals import NUM_DEMOS, proposals
+from stored_proposals import NUM_DEMOS, arguments, proposals
 
-from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
+from robust_instant_policy.evaluation.tables import Table
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.instant import Proposal
 from robust_instant_policy.policies.rip import DOF, robust_plan
@@ -42,7 +41,7 @@ def turns(proposal: Proposal) -> tuple[list[float], float]:
     return [sharpest_turn(path) for path in paths], key_error(robust, free)
 
 
-def measured(task_name: str, data: Path, samples: Path, llm: str, scenes: int) -> list[str]:
+def measured(task_name: str, data: Path, samples: Path, llm: str, scenes: int) -> tuple[str, ...]:
     """A line of the table."""
     rows, moved = [], []
     for _, policy, proposal in proposals(task_name, data, samples, llm, scenes):
@@ -52,23 +51,17 @@ def measured(task_name: str, data: Path, samples: Path, llm: str, scenes: int) -
         shown = [sharpest_turn(trajectory) for trajectory in policy.context.trajectories_]
     columns: list[FloatArray] = [np.array(shown), *np.array(rows).T]
     cells = [f"{1000 * np.median(column):.0f} ({1000 * column.max():.0f})" for column in columns]
-    return [task_name, *cells, f"{1000 * np.median(moved):.1f} ({1000 * max(moved):.1f})"]
+    return task_name, *cells, f"{1000 * np.median(moved):.1f} ({1000 * max(moved):.1f})"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("--samples", type=Path, required=True, help="samples.sqlite of a run of rip eval")
-    parser.add_argument("--data", type=Path, default=Path("data"), help="where the demonstrations are")
-    parser.add_argument("--tasks", nargs="+", default=SIMULATION_TASKS)
-    parser.add_argument("--llm", default="embedded", help="the model of that run")
     parser.add_argument("--scenes", type=int, default=20)
-    parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    lines = [["task", *COLUMNS, "moved at key steps"], ["---"] * (2 + len(COLUMNS))]
-    lines += [measured(task, options.data, options.samples, options.llm, options.scenes) for task in options.tasks]
-    body = "".join("| " + " | ".join(cells) + " |\n" for cells in lines)
-    tail = f"\nMillimetres, median (largest) over {options.scenes} scenes, and over {NUM_DEMOS} demonstrations.\n"
-    options.out.write_text(body + tail)
+    rows = [measured(task, options.data, options.samples, options.llm, options.scenes) for task in options.tasks]
+    note = f"Millimetres, median (largest) over {options.scenes} scenes, and over {NUM_DEMOS} demonstrations."
+    options.out.write_text(Table(("task", *COLUMNS, "moved at key steps"), tuple(rows), note).markdown())
     print(options.out.read_text())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from tqdm import tqdm
 
 import robust_instant_policy as rip
 from robust_instant_policy.evaluation.scenes import FIRST_TEST_SEED
+from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
 from robust_instant_policy.llm import ReplayedModel, SampleStore, model_name
 from robust_instant_policy.policies import InstantPolicy
 from robust_instant_policy.policies.instant import Proposal
@@ -28,3 +30,13 @@ def proposals(
     for seed in tqdm(range(FIRST_TEST_SEED, FIRST_TEST_SEED + scenes), desc=task_name):
         yield seed, policy, policy.propose(task.reset(seed), NUM_QUERIES)
     task.close()
+
+
+def arguments(doc: str | None) -> argparse.ArgumentParser:
+    """What every benchmark on stored samples must be told, but where the samples are."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("data"), help="where the demonstrations are")
+    parser.add_argument("--tasks", nargs="+", default=SIMULATION_TASKS)
+    parser.add_argument("--llm", default="embedded", help="the model of that run")
+    parser.add_argument("--out", type=Path, required=True, help="the table")
+    return parser

@@ -12,6 +12,7 @@ from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import TRAINED_METHODS, KeypointContext, make_trained_policy
 from robust_instant_policy.policies.training import Training
+from robust_instant_policy.policies.training_picture import training_picture
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 
 
@@ -29,8 +30,6 @@ def train(task: str, method: str, demos: Path, limit: int | None, training: Trai
     )
     with screen.stage(f"{method} on {len(demonstrations)} demonstrations"):
         policy.fit(demonstrations)
-    from robust_instant_policy.policies.diffusion.picture import training_picture  # PyTorch is there by now
-
     trained = policy.trained_
     picture = trained.path.with_suffix(".svg")
     write_whole(picture, training_picture(policy))

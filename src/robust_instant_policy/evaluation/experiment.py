@@ -18,6 +18,7 @@ from robust_instant_policy.evaluation.work import Hands, Outcome, Planned, Scene
 from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.policies import IMAGE_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import TrainingReport, no_report
+from robust_instant_policy.policies.training_picture import training_picture
 from robust_instant_policy.tasks import make_task
 
 TRAINING_FOLDER = "training"
@@ -178,8 +179,6 @@ def _train_missing(works: Sequence[SceneWork], setup: Setup, out: Path, progress
     with closing(Workbench(setup, report=progress.training)) as bench:
         for (task, variant), work in trained.items():
             policy = bench.train(work, variant)
-            from robust_instant_policy.policies.diffusion.picture import training_picture  # now that PyTorch is there
-
             picture = out / training_file(task, variant)
             if not picture.exists():
                 picture.parent.mkdir(exist_ok=True)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from robust_instant_policy.policies.diffusion.training import Rehearsal, Trained
+if TYPE_CHECKING:
+    from robust_instant_policy.policies.diffusion.training import Rehearsal, Trained
 
 REHEARSED = 3  # demonstrations that are drawn
 SMOOTHED = 20  # steps over which the drawn loss is averaged
