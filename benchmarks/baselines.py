@@ -12,7 +12,6 @@ import argparse
 import json
 import re
 from collections import defaultdict
-from contextlib import closing
 from pathlib import Path
 from statistics import median
 
@@ -32,9 +31,8 @@ def main() -> None:
     options = parser.parse_args()
     rows: dict[tuple, dict[EpisodeKey, Episode]] = defaultdict(dict)  # what two runs did counts once
     for run in options.runs:
-        with closing(open_episodes(run)) as episodes:
-            for row in episodes.rows:
-                rows[row.scene.task, row.variant.demos, row.variant.method, row.variant.steps][row.key] = row
+        for row in open_episodes(run).rows:
+            rows[row.scene.task, row.variant.demos, row.variant.method, row.variant.steps][row.key] = row
     trained = training_seconds(options.checkpoints)
     lines = [
         "| task | demonstrations | method | success | 95% interval | training | in | planning (median) |",

@@ -16,7 +16,16 @@ from pathlib import Path
 
 from ray.cluster_utils import Cluster as LocalCluster
 
-from robust_instant_policy.evaluation import Choice, Progress, Setup, Variant, make_suites, open_episodes, run_suites
+from robust_instant_policy.evaluation import (
+    STORE_FILE,
+    Choice,
+    Progress,
+    Setup,
+    Variant,
+    make_suites,
+    open_episodes,
+    run_suites,
+)
 from robust_instant_policy.evaluation.cluster import Cluster
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.processes import Processes
@@ -47,7 +56,7 @@ def main() -> None:
         out = options.out / name
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
-        store = out / "samples.sqlite"
+        store = out / STORE_FILE
         if options.samples:
             shutil.copy(options.samples, store)
         setup = Setup("embedded", bool(options.samples), store, options.data, 300.0, films=False)

@@ -23,7 +23,16 @@ from typing import Any
 # As the workers have it, or prompts differ in their last digits; before numpy is imported.
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
-from robust_instant_policy.evaluation import Choice, Progress, Setup, Suite, Variant, make_suites, run_suites
+from robust_instant_policy.evaluation import (
+    STORE_FILE,
+    Choice,
+    Progress,
+    Setup,
+    Suite,
+    Variant,
+    make_suites,
+    run_suites,
+)
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.processes import Processes
 from robust_instant_policy.evaluation.work import SceneWork
@@ -48,7 +57,7 @@ def main() -> None:
     choice = Choice(base, options.tasks, METHODS, options.episodes, objects=options.objects)
     (suite,) = make_suites(["table1"], choice)
     with tempfile.TemporaryDirectory() as folder:
-        store = Path(folder) / "samples.sqlite"
+        store = Path(folder) / STORE_FILE
         shutil.copy(options.samples, store)
         setup = Setup("embedded", True, store, options.data, 300.0, films=False)
         lines = _shares(suite, setup)

@@ -9,14 +9,13 @@ candidates fail and none is the odd one out. No model is asked and nothing is ex
 
 from __future__ import annotations
 
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from stored_proposals import NUM_DEMOS, NUM_QUERIES, arguments, proposals
 
-from robust_instant_policy.evaluation import Variant, open_episodes
+from robust_instant_policy.evaluation import STORE_FILE, Variant, open_episodes
 from robust_instant_policy.evaluation.tables import Table
 from robust_instant_policy.llm import model_name
 from robust_instant_policy.policies.rip import robust_plan
@@ -28,8 +27,7 @@ NOTE = "Candidates that fail or succeed when executed alone, in scenes in which 
 def executions(run: Path, task: str, llm: str) -> tuple[set[int], dict[int, list[bool]]]:
     """Seeds of the scenes in which `rip` succeeded, and which of each scene's candidates did by themselves."""
     rip, kat = (Variant(name, NUM_DEMOS, NUM_QUERIES, model=model_name(llm)) for name in ("rip", "kat"))
-    with closing(open_episodes(run)) as episodes:
-        rows = [row for row in episodes.rows if (row.scene.task, row.scene.objects) == (task, "seen")]
+    rows = [row for row in open_episodes(run).rows if (row.scene.task, row.scene.objects) == (task, "seen")]
     good = {row.scene.seed for row in rows if row.variant == rip and row.success}
     alone: dict[int, list[bool]] = {}
     for row in sorted((row for row in rows if row.variant == kat), key=lambda row: row.candidate):
@@ -41,7 +39,7 @@ def counted(run: Path, task: str, data: Path, llm: str) -> np.ndarray:
     """``(2, 2, 2)``: with or without `Proposal.variation`; candidates that fail or succeed; named, and all of them."""
     good, alone = executions(run, task, llm)
     counts = np.zeros((2, 2, 2), dtype=int)
-    for seed, _, proposal in proposals(task, data, run / "samples.sqlite", llm, len(alone)):
+    for seed, _, proposal in proposals(task, data, run / STORE_FILE, llm, len(alone)):
         if seed not in good:
             continue
         succeeded = np.array(alone[seed], dtype=int)

@@ -1,6 +1,8 @@
 """Rows, statistics and tables; what workers do is in test_evaluation_workers.py."""
 
 import math
+from contextlib import closing
+from dataclasses import replace
 from fractions import Fraction
 
 import pyarrow as pa
@@ -10,8 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
+from robust_instant_policy.cli import main
 from robust_instant_policy.errors import DatasetError, InvalidValueError, RipError, UnknownNameError
 from robust_instant_policy.evaluation import (
+    STORE_FILE,
     Analysis,
     Choice,
     Episode,
@@ -20,15 +24,20 @@ from robust_instant_policy.evaluation import (
     Suite,
     Variant,
     make_suites,
+    merge,
     open_episodes,
+    open_failures,
     paper,
 )
 from robust_instant_policy.evaluation.experiment import missing_work, wanted_plans
+from robust_instant_policy.evaluation.failures import video_file
 from robust_instant_policy.evaluation.manifest import Manifest, invocation
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test, wilson_interval
 from robust_instant_policy.evaluation.summary import Summary
 from robust_instant_policy.evaluation.tables import tables
 from robust_instant_policy.evaluation.work import MAX_DEATHS, Agenda, SceneWork
+from robust_instant_policy.llm import SampleStore
+from robust_instant_policy.query import Answer, Query
 
 RIP = Variant("rip", model="a model")
 KAT = Variant("kat", model="a model")
@@ -127,6 +136,16 @@ def test_a_kill_at_any_moment_loses_no_row(tmp_path):
     assert len(open_episodes(tmp_path).rows) == 4
 
 
+def test_reading_the_rows_of_a_run_under_way_changes_nothing_on_disk(tmp_path):
+    writer = open_episodes(tmp_path)
+    writer.add(episode(RIP, 0, True))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert len(open_episodes(tmp_path).rows) == 1
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    writer.add(episode(RIP, 1, True))
+    assert len(open_episodes(tmp_path).rows) == 2  # even if the writer is killed now
+
+
 def test_a_damaged_or_older_table_is_refused_in_one_line(tmp_path):
     (tmp_path / "episodes.parquet").write_bytes(b"PAR1 half a file")
     with pytest.raises(DatasetError, match="move it away"):
@@ -212,6 +231,15 @@ def test_methods_stand_in_one_order_whichever_was_run_first():
     assert [variant.method for variant in Summary(suite, rows).variants] == ["rip", "kat", "gp"]
 
 
+def test_rip_is_compared_over_the_tasks_that_the_other_method_was_tried_in():
+    dp = Variant("dp")
+    suite = Suite("table1", ("push-cube", "open-drawer"), (RIP, dp), (0, 1))
+    rows = [episode(variant, seed, variant == RIP or seed == 0) for variant in (RIP, dp) for seed in (0, 1)]
+    elsewhere = [replace(row, scene=replace(row.scene, task="open-drawer"), success=False) for row in rows[:2]]
+    against = tables(Summary(suite, rows + elsewhere))[1]
+    assert dict(zip(against.head, against.rows[0], strict=True))["difference"] == "+50.0"  # not 50 - 50
+
+
 def test_a_run_remembers_its_suites_and_the_commands_that_made_it(tmp_path):
     one = Suite("table1", ("push-cube",), (RIP,), (1,))
     two = Suite("table1", ("turn-faucet",), (Variant("rip-gauss"),), (1, 2))
@@ -222,6 +250,68 @@ def test_a_run_remembers_its_suites_and_the_commands_that_made_it(tmp_path):
     assert manifest.suites == (one.merged(two),)
     assert manifest.suites[0].tasks == ("push-cube", "turn-faucet")
     assert [one.command for one in manifest.invocations] == ["rip eval --out 'a b'"] * 2
+
+
+def a_run(folder, suite: Suite, rows: list[Episode], answers: list[str]) -> None:
+    with invocation(folder, [suite], ["rip", "eval", "--out", folder.name], "a model"):
+        table, failures = open_episodes(folder), open_failures(folder)
+        for row in rows:
+            table.add(row)
+            if not row.success:
+                failures.add(Failure(*row.key, "samples", True, False, 0.01, False))
+        table.close()
+        failures.close()
+    store = SampleStore(folder / STORE_FILE)
+    for sample, text in enumerate(answers):
+        store.write("a model", Query("1 2 ", max_tokens=4), "{}", sample, 0, Answer(text))
+    store.close()
+
+
+def test_runs_are_merged_and_what_two_of_them_did_counts_once(tmp_path):
+    one, two, out = (tmp_path / name for name in ("one", "two", "out"))
+    ours = Suite("table1", ("push-cube",), (RIP, KAT), (1, 2))
+    theirs = Suite("table1", ("push-cube",), (RIP, Variant("gp")), (1, 2))
+    a_run(one, ours, [episode(RIP, 1, True), episode(RIP, 2, False)], ["3", "4"])
+    a_run(two, theirs, [episode(RIP, 2, True), episode(Variant("gp"), 1, True)], ["3", "4", "5"])
+    film = video_file(*episode(RIP, 2, False).key)
+    (one / film).parent.mkdir()
+    (one / film).write_bytes(b"a film")
+
+    assert [(share.new, share.known) for share in merge([one, two], out)] == [(2, 0), (1, 1)]
+    rows = open_episodes(out).rows
+    assert rows == [episode(RIP, 1, True), episode(RIP, 2, False), episode(Variant("gp"), 1, True)]
+    assert [failure.key for failure in open_failures(out).rows] == [rows[1].key]
+    assert (out / film).read_bytes() == b"a film"
+    with closing(SampleStore(out / STORE_FILE)) as store:
+        assert store.models()[0].answers == 3
+    manifest = Manifest.read(out)
+    assert manifest.suites == (ours.merged(theirs),)
+    assert [command.command for command in manifest.invocations] == ["rip eval --out one", "rip eval --out two"]
+
+    everything = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    assert [(share.new, share.known) for share in merge([two, one], out)] == [(0, 2), (0, 2)]
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == everything
+
+
+def test_the_failure_that_was_examined_is_that_of_the_row_that_counts(tmp_path):
+    won, lost, out = (tmp_path / name for name in ("won", "lost", "out"))
+    suite = Suite("table1", ("push-cube",), (RIP,), (1,))
+    a_run(won, suite, [episode(RIP, 1, True)], [])
+    a_run(lost, suite, [episode(RIP, 1, False)], [])
+    merge([won, lost], out)
+    assert open_episodes(out).rows[0].success
+    assert open_failures(out).rows == []
+
+
+def test_a_run_that_cannot_be_merged_is_told_before_anything_is_written(tmp_path, capsys):
+    one, out = tmp_path / "one", tmp_path / "out"
+    a_run(one, Suite("table1", ("push-cube",), (RIP,), (1,)), [episode(RIP, 1, True)], [])
+    for runs, words in (([one, tmp_path / "nothing"], "nothing holds no executions"), ([one, out], "itself one")):
+        assert main(["merge", *map(str, runs), "--out", str(out)]) != 0
+        assert words in capsys.readouterr().err
+        assert not out.exists()
+    assert main(["merge", str(one), "--out", str(out)]) == 0
+    assert str(out / "index.html") in capsys.readouterr().out
 
 
 def test_a_worker_stays_with_its_task_and_others_take_another():

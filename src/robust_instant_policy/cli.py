@@ -140,6 +140,10 @@ def _parser() -> argparse.ArgumentParser:
     report = command("report", _report, "write the report of a run, or of an evaluation, again")
     report.add_argument("folder", type=Path, metavar="DIR")
 
+    merge = command("merge", _merge, "bring several evaluations together in one folder")
+    merge.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders that rip eval --out wrote")
+    merge.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder, or one to be added to")
+
     view = command("view", _view, "a page that shows every demonstration of a folder")
     view.add_argument("--demos", type=Path, required=True, metavar="DIR")
     view.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR.html)")
@@ -264,8 +268,8 @@ def _plan(options: argparse.Namespace) -> int:
 
 
 def _eval(options: argparse.Namespace) -> int:
-    from robust_instant_policy.evaluate import STORE_FILE, evaluate
-    from robust_instant_policy.evaluation import Choice, Setup, Variant, make_suites
+    from robust_instant_policy.evaluate import evaluate
+    from robust_instant_policy.evaluation import STORE_FILE, Choice, Setup, Variant, make_suites
     from robust_instant_policy.llm import model_name
     from robust_instant_policy.policies.training import DEFAULT_STEPS
 
@@ -322,6 +326,19 @@ def _report(options: argparse.Namespace) -> int:
     from robust_instant_policy.report import write_report
 
     print(write_report(options.folder))
+    return 0
+
+
+def _merge(options: argparse.Namespace) -> int:
+    from robust_instant_policy.evaluation.merging import Share, merge
+    from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
+
+    def report(share: Share) -> None:
+        print(f"{share.folder}: {share.new} executions, {share.known} more known already", flush=True)
+
+    merge(options.runs, options.out, report)
+    publish(options.out)
+    print(options.out / PAGE_FILE)
     return 0
 
 

@@ -15,8 +15,6 @@ from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
 from robust_instant_policy.evaluation.work import Hands, Outcome
 from robust_instant_policy.llm import model_name
 
-STORE_FILE = "samples.sqlite"
-
 
 def evaluate(
     suites: Sequence[Suite], setup: Setup, out: Path, workers: int | None, ray: str | None, arguments: Sequence[str]

@@ -21,7 +21,7 @@ from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.policies.training_picture import training_picture
 from robust_instant_policy.tasks import make_task
 
-TRAINING_FOLDER = "training"
+PLAN_FOLDER, TRAINING_FOLDER = "plans", "training"
 
 Plan = tuple[Scene, Variant]
 
@@ -44,7 +44,7 @@ def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, p
     done once, and everything in one scene together, so that its samples are asked for once.
     """
     make_folder(out)
-    with _one_writer(out), closing(open_episodes(out)) as episodes, closing(open_failures(out)) as failures:
+    with one_writer(out), closing(open_episodes(out)) as episodes, closing(open_failures(out)) as failures:
         wanted = wanted_plans(suites)
         left = executions_left(episodes.rows)
         done = sum(left.get(plan) == 0 for plan in wanted)
@@ -74,7 +74,8 @@ def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, p
 
 
 @contextmanager
-def _one_writer(out: Path) -> Iterator[None]:
+def one_writer(out: Path) -> Iterator[None]:
+    """Keep other processes from writing into the run's folder ``out``; `DatasetError` when one does."""
     descriptor = lock_folder(out)
     try:
         yield
@@ -102,7 +103,7 @@ def executions_left(rows: Iterable[Episode]) -> dict[Plan, int]:
 
 def plan_file(scene: Scene, variant: Variant) -> str:
     """Where, in a run's folder, a plan is kept that is to be drawn."""
-    return f"plans/{scene}-{variant}.json"
+    return f"{PLAN_FOLDER}/{scene}-{variant}.json"
 
 
 def training_file(task: str, variant: Variant) -> str:

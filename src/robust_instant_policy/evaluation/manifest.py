@@ -69,6 +69,13 @@ class Manifest:
             known[key] = known[key].merged(suite) if key in known else suite
         return replace(self, suites=tuple(known.values()))
 
+    def joined(self, other: Manifest) -> Manifest:
+        """What both of them say, each command once."""
+        commands = dict.fromkeys((*self.invocations, *other.invocations))
+        return replace(
+            self.with_suites(other.suites), invocations=tuple(sorted(commands, key=lambda command: command.began))
+        )
+
 
 def _suite(content: dict) -> Suite:
     variants = tuple(Variant(**one) for one in content["variants"])

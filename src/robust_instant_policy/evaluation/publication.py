@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 
 from robust_instant_policy.datasets.files import write_whole
@@ -32,10 +31,7 @@ def publish(out: Path) -> str:
 
     Raises `DatasetError` where nothing has been executed yet.
     """
-    with closing(open_episodes(out)) as table:
-        episodes = table.rows
-    with closing(open_failures(out)) as table_of_failures:
-        failures = table_of_failures.rows
+    episodes, failures = open_episodes(out).rows, open_failures(out).rows
     if not episodes:
         raise DatasetError(f"{out} holds no executions yet; run rip eval --out {out} first")
     manifest = Manifest.read(out)

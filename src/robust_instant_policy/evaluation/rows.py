@@ -44,8 +44,9 @@ class RowFile(Generic[R]):
     """The rows of ``path``, each added once.
 
     A row is on disk when `add` returns: in the parquet file itself, or in a journal beside it (one line of JSON a row)
-    that is folded into it every few seconds, on `close`, and when the file is next opened. A column that a file lacks
-    because it is older has the default of its field.
+    that is folded into it every few seconds, on `close`, and before the next process adds its first row. Who only
+    reads ``rows`` and does not `close` changes nothing on disk, and may do so while another process writes. A column
+    that a file lacks because it is older has the default of its field.
     """
 
     def __init__(self, kind: type[R], path: str | Path):
@@ -54,22 +55,28 @@ class RowFile(Generic[R]):
         self._schema = pa.schema(_columns(kind))
         self._journal_path = self.path.with_suffix(".journal")
         self._journal: IO[str] | None = None
+        journalled = self._read_journal()  # first: what is folded in meanwhile is then seen twice, not never
         self._table = self._read()
         self.rows: list[R] = [self._row(values) for values in self._table.to_pylist()]
         self._keys = {row.key for row in self.rows}
         self._pending: list[R] = []
         self._folded_at = time.monotonic()
-        self._recover()
+        for row in journalled:
+            if row.key not in self._keys:
+                self._take(row)
 
     def add(self, row: R) -> None:
         """Keep ``row``, on disk when this returns; one whose key is known already is not kept twice."""
         if row.key in self._keys:
             return
+        if self._journal is None:
+            self._fold()
         self._take(row)
         try:
             if self._journal is None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._journal = self._journal_path.open("a", encoding="utf-8")
+                self._journal.truncate(0)  # the rest of a row of which half was written
             self._journal.write(json.dumps(_flat(row)) + "\n")
             self._journal.flush()
             os.fsync(self._journal.fileno())
@@ -122,18 +129,19 @@ class RowFile(Generic[R]):
             )
         return table.select(self._schema.names).cast(self._schema)
 
-    def _recover(self) -> None:
-        """Fold in what a killed run left in its journal; its last line may be half a row."""
-        if not self._journal_path.exists():
-            return
-        for line in self._journal_path.read_text(encoding="utf-8").splitlines():
+    def _read_journal(self) -> list[R]:
+        """What a killed run left, or a running one has not folded in yet; the last line may be half a row."""
+        rows: list[R] = []
+        try:
+            lines = self._journal_path.read_text(encoding="utf-8").splitlines()
+        except FileNotFoundError:
+            return rows
+        for line in lines:
             try:
-                row = self._row(json.loads(line))
+                rows.append(self._row(json.loads(line)))
             except (ValueError, KeyError):
                 break
-            if row.key not in self._keys:
-                self._take(row)
-        self.close()
+        return rows
 
     def _row(self, values: dict[str, Any]) -> R:
         return _build(self._kind, values)

@@ -51,9 +51,11 @@ class Summary:
         rows = [row for row in self._rows.get(variant, ()) if task in (None, row.scene.task)]
         return Rate(sum(row.success for row in rows), len(rows)) if rows else None
 
-    def of_tasks(self, variant: Variant) -> list[float]:
-        """The success rate in each task that the variant was tried in."""
-        rates = (self.rate(variant, task) for task in self.tasks)
+    def of_tasks(self, variant: Variant, beside: Variant | None = None) -> list[float]:
+        """The success rate in each task that the variant was tried in, and ``beside``, if given, was tried in, too."""
+        rates = (
+            self.rate(variant, task) for task in self.tasks if beside is None or self.rate(beside, task) is not None
+        )
         return [rate.value for rate in rates if rate is not None]
 
     def over_tasks(self, variant: Variant) -> tuple[float, float]:

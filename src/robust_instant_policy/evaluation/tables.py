@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.episodes import Episode
@@ -64,8 +65,8 @@ def success_table(summary: Summary) -> Table:
                 row.append(_percent(paper.table1(variant.method, task)))
         stars = ""
         if ours is not None and variant != ours:
-            stars = mark(t_test(summary.of_tasks(ours), summary.of_tasks(variant)))
-            stars = stars if _mean(summary, ours) > _mean(summary, variant) else ""
+            own, others = _both(summary, ours, variant)
+            stars = mark(t_test(own, others)) if fmean(own) > fmean(others) else ""
         row += [_spread(summary, variant, stars), _paper_average(variant, told)]
         rows.append(tuple(row))
     counts = ", ".join(f"{variant.method} {_executions(summary, variant)}" for variant in summary.variants)
@@ -87,12 +88,12 @@ def test_table(summary: Summary) -> Table | None:
     rows = []
     for variant in others:
         paired = paired_test(summary.of_scenes(ours), summary.of_scenes(variant))
-        difference = 100 * (_mean(summary, ours) - _mean(summary, variant))
+        own, theirs = _both(summary, ours, variant)
         rows.append(
             (
                 _name(variant, summary),
-                f"{difference:+.1f}",
-                _p(t_test(summary.of_tasks(ours), summary.of_tasks(variant))),
+                f"{100 * (fmean(own) - fmean(theirs)):+.1f}" if own else NONE,
+                _p(t_test(own, theirs)),
                 str(paired.scenes),
                 str(paired.better),
                 str(paired.worse),
@@ -101,8 +102,9 @@ def test_table(summary: Summary) -> Table | None:
         )
     head = ("rip against", "difference", "t-test p", "shared scenes", "rip better in", "worse in", "paired p")
     note = (
-        "Difference in percentage points of the averages over tasks. The t-test is the paper's, over tasks; the paired "
-        "test is exact, over the scenes that both methods were tried in (McNemar's where each has one execution)."
+        "Difference in percentage points of the averages over the tasks that both methods were tried in. The t-test is "
+        "the paper's, over these tasks; the paired test is exact, over the scenes that both methods were tried in "
+        "(McNemar's where each has one execution)."
     )
     return Table(head, tuple(rows), note)
 
@@ -196,8 +198,9 @@ def _name(variant: Variant, summary: Summary) -> str:
     return variant.method if len(same) == 1 else str(variant)
 
 
-def _mean(summary: Summary, variant: Variant) -> float:
-    return summary.over_tasks(variant)[0]
+def _both(summary: Summary, one: Variant, other: Variant) -> tuple[list[float], list[float]]:
+    """The success rates of both in the tasks that both were tried in."""
+    return summary.of_tasks(one, other), summary.of_tasks(other, one)
 
 
 def _cell(rate: Rate | None, best: float) -> str:

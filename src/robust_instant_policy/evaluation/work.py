@@ -15,6 +15,7 @@ from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.policies import Plan
 from robust_instant_policy.policies.training import DEFAULT_CHECKPOINTS
 
+STORE_FILE = "samples.sqlite"  # in a run's folder: every answer of the language model
 MAX_DEATHS = 3  # workers that one scene may take with it before the run gives up
 
 

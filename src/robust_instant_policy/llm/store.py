@@ -134,6 +134,34 @@ class SampleStore:
                 raise
             self._db.execute("COMMIT")
 
+    def take(self, other: str | Path) -> int:
+        """Copy what the store at ``other`` holds and this one does not; returns how many answers that were.
+
+        All or nothing of it is copied. Raises `UsageError` where ``other`` is not a store.
+        """
+        if not Path(other).is_file():
+            raise UsageError(f"no sample store at {other}")
+        with self._lock:
+            before = self._count()
+            try:
+                self._db.execute("ATTACH ? AS other", (str(other),))
+                try:
+                    self._db.execute("BEGIN IMMEDIATE")
+                    for table in ("queries", "answers", "failures"):
+                        self._db.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM other.{table}")
+                    self._db.execute("COMMIT")
+                finally:
+                    if self._db.in_transaction:
+                        self._db.execute("ROLLBACK")
+                    self._db.execute("DETACH other")
+            except sqlite3.DatabaseError as error:
+                raise UsageError(f"the samples of {other} cannot be copied to {self.path} ({error})") from None
+            return self._count() - before
+
+    def _count(self) -> int:
+        count: int = self._db.execute("SELECT COUNT(text) FROM answers").fetchone()[0]
+        return count
+
     def read(self, model: str, query: Query, settings: str, sample: int) -> list[Answer | None]:
         """All attempts at one sample, in order; None stands for "nothing acceptable came". Empty: never asked."""
         rows = self._select(
