@@ -317,7 +317,7 @@ def _train(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    if (options.folder / "episodes.parquet").exists():
+    if any(options.folder.glob("episodes.*")):  # the table, or the journal of one that has just begun
         from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
 
         publish(options.folder)

@@ -27,6 +27,8 @@ def evaluate(
 
     def recording(task: str, there: int, count: int, thrown_away: int) -> None:
         screen.done_so_far(f"{task}: recording ({thrown_away} thrown away)", there, count)
+        if there == count:
+            screen.say(f"  {task}: {count} demonstrations recorded, {thrown_away} thrown away")
 
     def outcome(done: int, total: int, what: Outcome | None) -> None:
         if isinstance(what, Analysis):
