@@ -20,6 +20,7 @@ from robust_instant_policy.evaluation.episodes import EpisodeKey
 from robust_instant_policy.policies.diffusion import checkpoint
 
 KEPT = Path(__file__).parents[1] / "results" / "baselines" / "training.json"
+UNTRAINED, DEMOS = ("neighbours", "gp"), 10  # shown beside those that are trained, with so many demonstrations
 NAME = re.compile(r"(?P<method>kat-dp|dp)-(?P<task>.+)-(?P<demos>\d+)-[0-9a-f]+")
 
 
@@ -32,6 +33,8 @@ def main() -> None:
     rows: dict[tuple, dict[EpisodeKey, Episode]] = defaultdict(dict)  # what two runs did counts once
     for run in options.runs:
         for row in open_episodes(run).rows:
+            if row.variant.steps is None and (row.variant.method not in UNTRAINED or row.variant.demos != DEMOS):
+                continue
             rows[row.scene.task, row.variant.demos, row.variant.method, row.variant.steps][row.key] = row
     trained = training_seconds(options.checkpoints)
     lines = [

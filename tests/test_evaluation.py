@@ -32,6 +32,7 @@ from robust_instant_policy.evaluation import (
 from robust_instant_policy.evaluation.experiment import missing_work, wanted_plans
 from robust_instant_policy.evaluation.failures import video_file
 from robust_instant_policy.evaluation.manifest import Manifest, invocation
+from robust_instant_policy.evaluation.publication import publish
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test, wilson_interval
 from robust_instant_policy.evaluation.summary import Summary
 from robust_instant_policy.evaluation.tables import tables
@@ -312,6 +313,18 @@ def test_a_run_that_cannot_be_merged_is_told_before_anything_is_written(tmp_path
         assert not out.exists()
     assert main(["merge", str(one), "--out", str(out)]) == 0
     assert str(out / "index.html") in capsys.readouterr().out
+
+
+def test_what_table1_shows_has_no_section_of_its_own_in_the_report(tmp_path):
+    table1, chosen = (Suite(name, ("push-cube",), (RIP,), (1,)) for name in ("table1", "chosen"))
+    a_run(tmp_path, chosen, [episode(RIP, 1, True)], [])
+    publish(tmp_path)
+    assert (tmp_path / "chosen.md").exists()
+    (tmp_path / "chosen.md").unlink()
+    a_run(tmp_path, table1, [], [])
+    publish(tmp_path)
+    assert (tmp_path / "table1.md").exists()
+    assert not (tmp_path / "chosen.md").exists()
 
 
 def test_a_worker_stays_with_its_task_and_others_take_another():
