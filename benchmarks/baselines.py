@@ -1,7 +1,7 @@
 """What baselines reach and what they cost: success, seconds of training, seconds of planning, from runs of `rip eval`.
 
 rip eval --methods kat-dp --demos 200 --episodes 20 --out runs/proof    (and the like)
-python benchmarks/baselines.py runs/proof runs/five --checkpoints checkpoints --table docs/tables/baselines.md
+python benchmarks/baselines.py results/paper runs/proof --checkpoints checkpoints --table docs/tables/baselines.md
 
 What trainings took is kept in `results/baselines/training.json`, so that checkpoints need not be.
 """
@@ -17,6 +17,7 @@ from statistics import median
 
 from robust_instant_policy.evaluation import Episode, open_episodes, wilson_interval
 from robust_instant_policy.evaluation.episodes import EpisodeKey
+from robust_instant_policy.policies import METHOD_NAMES
 from robust_instant_policy.policies.diffusion import checkpoint
 
 KEPT = Path(__file__).parents[1] / "results" / "baselines" / "training.json"
@@ -41,7 +42,7 @@ def main() -> None:
         "| task | demonstrations | method | success | 95% interval | training | in | planning (median) |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for (task, demos, method, steps), by_key in sorted(rows.items(), key=lambda item: item[0][:2]):
+    for (task, demos, method, steps), by_key in sorted(rows.items(), key=lambda item: place(*item[0])):
         own = by_key.values()
         successes = sum(row.success for row in own)
         low, high = wilson_interval(successes, len(own))
@@ -52,6 +53,11 @@ def main() -> None:
         lines.append(f"| {task} | {demos} | {method} | {rate} | {training} | {seconds} | {planning:.2f} s |")
     options.table.write_text("\n".join(lines) + "\n")
     print(options.table.read_text())
+
+
+def place(task: str, demos: int, method: str, steps: int | None) -> tuple:
+    """In the table: by task and demonstrations, methods as in other tables."""
+    return task, demos, METHOD_NAMES.index(method), steps or 0
 
 
 def training_seconds(folder: Path) -> dict[tuple[str, str, int, int], float]:

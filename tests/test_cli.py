@@ -96,7 +96,7 @@ def test_a_model_file_that_is_missing_or_corrupt_is_told(workbench, tmp_path, ca
 
 
 def test_no_space_left_is_told_and_what_was_there_stays(workbench, tmp_path, capsys, monkeypatch):
-    import robust_instant_policy.datasets.files as files
+    import robust_instant_policy.files as files
 
     folder = tmp_path / "data"
     shutil.copytree(workbench / "data/push-cube", folder)

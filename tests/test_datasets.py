@@ -130,6 +130,15 @@ def test_recording_in_one_go_or_in_two_leaves_identical_folders(tmp_path):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
 
 
+def test_a_folder_that_was_recorded_anew_is_read_anew(tmp_path):
+    for seed in (1, 2):
+        shutil.rmtree(tmp_path / "d", ignore_errors=True)
+        with writer_of(tmp_path / "d") as writer:
+            writer.add(demonstration(seed))
+        (back,) = load_demonstrations(tmp_path / "d")
+        np.testing.assert_allclose(back.trajectory.actions, demonstration(seed).trajectory.actions, atol=1e-6)
+
+
 def test_the_same_images_always_make_the_same_video():
     film = images(0)
     assert len({encode_video(film, RATE_HZ) for _ in range(80)}) == 1
@@ -262,6 +271,7 @@ def test_a_folder_with_other_files_is_never_written_to(tmp_path):
 
 
 def test_a_video_without_images_leaves_no_file_and_odd_images_are_refused(tmp_path):
+    (tmp_path / "none.mp4").write_bytes(b"of the run before")
     with VideoWriter(tmp_path / "none.mp4", fps=20):
         pass
     assert not (tmp_path / "none.mp4").exists()

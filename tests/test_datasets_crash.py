@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations, load_frames
-from robust_instant_policy.datasets.files import PART_SUFFIX
 from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.files import PART_SUFFIX
 from tests.datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration
 
 HERE = Path(__file__).parent

@@ -183,6 +183,17 @@ def test_robomimic_files_become_demonstrations(tmp_path):
         assert demo.rate_hz == 20.0
 
 
+def test_two_robomimic_files_make_one_folder_and_none_of_their_episodes_is_lost_or_doubled(tmp_path):
+    (tmp_path / "other").mkdir()
+    first = robomimic_file(tmp_path / "lift.hdf5")
+    second = robomimic_file(tmp_path / "other" / "lift.hdf5")  # of the same name, with other motions
+    with h5py.File(second, "r+") as file:
+        for episode in file["data"].values():
+            episode["obs/robot0_eef_pos"][...] += 0.1
+    for path, count in ((first, 4), (second, 8), (first, 8), (second, 8)):
+        assert convert_demonstrations(path, tmp_path / "lift", TASK, "lift it", Rig(TRIANGLE)) == count
+
+
 def test_what_a_robomimic_file_lacks_is_said_and_what_is_known_can_be_given(tmp_path):
     message = refusal(import_demonstrations, robomimic_file(tmp_path / "flat.hdf5", depth=False), TASK, Rig(TRIANGLE))
     assert "depth" in message

@@ -1,6 +1,7 @@
 """Rows, statistics and tables; what workers do is in test_evaluation_workers.py."""
 
 import math
+import re
 from contextlib import closing
 from dataclasses import replace
 from fractions import Fraction
@@ -28,20 +29,23 @@ from robust_instant_policy.evaluation import (
     open_episodes,
     open_failures,
     paper,
+    rows,
 )
-from robust_instant_policy.evaluation.experiment import missing_work, wanted_plans
+from robust_instant_policy.evaluation.experiment import missing_work, plan_file, wanted_plans
 from robust_instant_policy.evaluation.failures import video_file
 from robust_instant_policy.evaluation.manifest import Manifest, invocation
 from robust_instant_policy.evaluation.publication import publish
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test, wilson_interval
 from robust_instant_policy.evaluation.summary import Summary
 from robust_instant_policy.evaluation.tables import tables
+from robust_instant_policy.evaluation.variant import labels
 from robust_instant_policy.evaluation.work import MAX_DEATHS, Agenda, SceneWork
 from robust_instant_policy.llm import SampleStore
 from robust_instant_policy.query import Answer, Query
 
 RIP = Variant("rip", model="a model")
 KAT = Variant("kat", model="a model")
+SCENE = Scene("push-cube", "seen", 0)
 
 
 def episode(variant: Variant, seed: int, success: bool, candidate: int = 0, of: int = 1) -> Episode:
@@ -147,6 +151,18 @@ def test_reading_the_rows_of_a_run_under_way_changes_nothing_on_disk(tmp_path):
     assert len(open_episodes(tmp_path).rows) == 2  # even if the writer is killed now
 
 
+def test_a_full_disk_doubles_no_row_once_there_is_space_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(rows, "FOLD_SECONDS", 0.0)
+    table = open_episodes(tmp_path)
+    table.add(episode(RIP, 0, True))
+    with monkeypatch.context() as full:
+        full.setattr(rows, "write_whole", lambda path, content: (_ for _ in ()).throw(DatasetError("no space left")))
+        with pytest.raises(DatasetError, match="no space"):
+            table.add(episode(RIP, 1, True))
+    table.close()
+    assert [row.scene.seed for row in open_episodes(tmp_path).rows] == [0, 1]
+
+
 def test_a_damaged_or_older_table_is_refused_in_one_line(tmp_path):
     (tmp_path / "episodes.parquet").write_bytes(b"PAR1 half a file")
     with pytest.raises(DatasetError, match="move it away"):
@@ -241,6 +257,27 @@ def test_rip_is_compared_over_the_tasks_that_the_other_method_was_tried_in():
     assert dict(zip(against.head, against.rows[0], strict=True))["difference"] == "+50.0"  # not 50 - 50
 
 
+def test_methods_without_a_task_in_common_are_not_compared():
+    suite = Suite("table1", ("push-cube", "open-drawer"), (RIP, KAT), (0,))
+    elsewhere = replace(episode(KAT, 0, True), scene=Scene("open-drawer", "seen", 0))
+    success, against = tables(Summary(suite, [episode(RIP, 0, True), elsewhere]))
+    assert len(success.rows) == 2
+    assert against.rows[0][1:] == ("–", "–", "0", "0", "0", "–")
+
+
+def test_variants_that_differ_in_the_model_only_are_told_apart_everywhere():
+    two = [Variant("rip", model=model) for model in ("gpt-4o", "a/b c")]
+    assert labels(two) == ["rip (model gpt-4o)", "rip (model a/b c)"]
+    assert labels([two[0], KAT]) == ["rip", "kat"]
+    for name in (video_file(SCENE, two[0], 0), plan_file(SCENE, two[1])):
+        assert name not in (video_file(SCENE, two[1], 0), plan_file(SCENE, two[0]))
+        assert re.fullmatch(r"\w+/[\w.-]+", name)
+    shown = [replace(variant, demos=demos) for variant in two for demos in (1, 3)]
+    suite = Suite("demos", ("push-cube",), tuple(shown), (0,))
+    (table,) = tables(Summary(suite, [episode(variant, 0, variant.model == "gpt-4o") for variant in shown]))
+    assert [(row[0], row[1][:3].strip()) for row in table.rows] == [(labels(two)[0], "100"), (labels(two)[1], "0 ±")]
+
+
 def test_a_run_remembers_its_suites_and_the_commands_that_made_it(tmp_path):
     one = Suite("table1", ("push-cube",), (RIP,), (1,))
     two = Suite("table1", ("turn-faucet",), (Variant("rip-gauss"),), (1, 2))
@@ -325,6 +362,16 @@ def test_what_table1_shows_has_no_section_of_its_own_in_the_report(tmp_path):
     publish(tmp_path)
     assert (tmp_path / "table1.md").exists()
     assert not (tmp_path / "chosen.md").exists()
+
+
+def test_objects_of_code_and_downloaded_ones_have_a_table_each(tmp_path):
+    for assets, won in (("code", True), ("maniskill", False)):
+        scene = Scene("push-cube", "seen", 1, assets)
+        suite = Suite("table1", ("push-cube",), (KAT,), (1,), assets=assets)
+        a_run(tmp_path, suite, [replace(episode(KAT, 1, won), scene=scene)], [])
+    publish(tmp_path)
+    assert "**100**" in (tmp_path / "table1.md").read_text()
+    assert "**0**" in (tmp_path / "table1-maniskill.md").read_text()
 
 
 def test_a_worker_stays_with_its_task_and_others_take_another():

@@ -14,7 +14,6 @@ import pytest
 
 from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import load_demonstrations
-from robust_instant_policy.datasets.files import lock_folder
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation import (
     Choice,
@@ -36,6 +35,7 @@ from robust_instant_policy.evaluation.failures import Inquest, film, true_keypoi
 from robust_instant_policy.evaluation.manifest import invocation
 from robust_instant_policy.evaluation.processes import Processes
 from robust_instant_policy.evaluation.publication import publish
+from robust_instant_policy.files import lock_folder
 from robust_instant_policy.policies import KeypointContext, Neighbours
 from robust_instant_policy.tasks import make_task
 

@@ -44,6 +44,14 @@ def test_it_is_ready_within_three_seconds():
     model.close()
 
 
+def test_a_proxy_for_the_world_outside_is_not_asked_for_the_model_inside(monkeypatch):
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+    monkeypatch.delenv("no_proxy", raising=False)
+    model = connect("embedded")
+    assert model.count_tokens("12 3") == 5
+    model.close()
+
+
 def test_every_answer_keeps_the_grammar_and_samples_differ(embedded):
     answers = embedded.sample([question(3), question(4)], Sampling(5, temperature=1.5))
     texts = [answer.text.split() for own in answers for answer in own]

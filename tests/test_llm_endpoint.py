@@ -103,7 +103,7 @@ class FaultyProxy:
         body = await reader.readexactly(length)
         if fault == "hang":
             await reader.read()  # until the other end gives up
-        elif fault in ("429", "500"):
+        elif fault in ("401", "429", "500"):
             writer.write(_reply(b'{"error": {"message": "try later"}}', status=fault))
         elif fault == "garbage":
             writer.write(_reply(random.Random(0).randbytes(500)))
@@ -248,6 +248,39 @@ def test_the_key_is_taken_from_the_environment_and_never_told(proxy, monkeypatch
     model = connect(f"{proxy(lambda: 'pass').url}#anything")
     model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30))
     assert "abcdefgh" not in repr(vars(model))
+
+
+@pytest.mark.parametrize(("key", "works"), [("sk-abcdefghijklmnop\n", True), ("sk-abcdefgh\nijkl", False)])
+def test_a_key_with_a_line_break_is_not_told_either(proxy, monkeypatch, key, works):
+    monkeypatch.setenv("OPENAI_API_KEY", key)
+    model = connect(f"{proxy(lambda: 'pass').url}#anything")
+    if works:  # what a file or a pipe leaves behind a key
+        assert model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30))[0]
+    else:
+        with pytest.raises(ModelError, match="OPENAI_API_KEY holds characters that no key has") as caught:
+            model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30))
+        assert "abcdefgh" not in str(caught.value)
+
+
+def test_a_server_that_refuses_half_way_is_told_in_one_line(proxy):
+    model = Endpoint(proxy(sequence("pass", "401", "401", "401")).url, "anything", style="completions")
+    model._honours_n = False  # so that samples are asked for side by side
+    with pytest.raises(ModelError, match="refused the key"):
+        model.sample([PAIRS], Sampling(3, temperature=0.5, deadline_s=30))
+
+
+def test_the_environments_proxy_is_used_for_other_machines_only(proxy, monkeypatch):
+    between = proxy(lambda: "500")
+    monkeypatch.setenv("http_proxy", between.url.removesuffix("/v1"))
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ModelError, match="answered 500"):
+        connect("http://llm.example.invalid/v1#m").sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=2))
+    assert between.seen
+    seen = len(between.seen)
+    with pytest.raises(ModelError, match="nothing answers"):
+        connect("http://127.0.0.1:9/v1#m").sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30))
+    assert len(between.seen) == seen
 
 
 def test_it_works_where_an_event_loop_is_running(server):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from robust_instant_policy.console import StageConsole, TrainingScreen
 from robust_instant_policy.datasets import load_demonstrations
-from robust_instant_policy.datasets.files import write_whole
 from robust_instant_policy.errors import UnknownNameError
+from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import TRAINED_METHODS, KeypointContext, make_trained_policy
 from robust_instant_policy.policies.training import Training

@@ -15,9 +15,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.files import finished_files
 from robust_instant_policy.datasets.video import decode_video
 from robust_instant_policy.errors import DatasetError, NoDemonstrationsError
+from robust_instant_policy.files import finished_files
 
 CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
 STATISTICS_PREFIX = "stats/"  # columns of meta/episodes that only those who normalise need
@@ -52,7 +52,7 @@ class Folder:
         path = self.root / self.info["data_path"].format(
             chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
         )
-        table = _read_data(path, tuple(names))
+        table = _read_data(path, tuple(names), _stamp(path))
         table = table.filter(pc.equal(table["episode_index"], row["episode_index"])).sort_by("frame_index")
         if len(table) != row["length"]:
             raise DatasetError(
@@ -136,8 +136,17 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
 
 
 @lru_cache(maxsize=1)  # files that hold many episodes are read once, not once for each
-def _read_data(path: Path, names: tuple[str, ...]) -> pa.Table:
+def _read_data(path: Path, names: tuple[str, ...], stamp: tuple[int, ...]) -> pa.Table:
     return read_table(path, ["episode_index", "frame_index", *names])
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    """Changes whenever the file does."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ()
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _read_episodes(root: Path, count: int) -> list[dict[str, Any]]:

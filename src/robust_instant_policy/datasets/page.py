@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.files import write_whole
 from robust_instant_policy.datasets.folder import open_folder, read_json
 from robust_instant_policy.datasets.reader import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray, project
 
 MAX_POINTS = 240  # of a path that are drawn

@@ -12,8 +12,8 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from robust_instant_policy.datasets.files import write_whole
 from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.files import write_whole
 
 CODEC = "libx264"
 PIXEL_FORMAT = "yuv420p"
@@ -77,7 +77,7 @@ class VideoEncoder:
 
 
 class VideoWriter:
-    """Writes a video to ``path`` when closed, whole; no file where no image came.
+    """Writes a video to ``path`` when closed, whole; no file, and none from before, where no image came.
 
     >>> with VideoWriter("run.mp4", fps=20) as video:
     ...     task.execute(trajectory, on_frame=video.add)
@@ -101,6 +101,8 @@ class VideoWriter:
         content = self._encoder.finish()
         if content:
             write_whole(self._path, content)
+        else:
+            self._path.unlink(missing_ok=True)
 
 
 def encode_video(images: NDArray[np.uint8], rate_hz: float) -> bytes:

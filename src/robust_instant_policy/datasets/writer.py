@@ -14,14 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.files import (
-    PART_SUFFIX,
-    finished_files,
-    lock_folder,
-    make_folder,
-    write_error,
-    write_whole,
-)
 from robust_instant_policy.datasets.folder import Folder, open_folder, read_json
 from robust_instant_policy.datasets.images import encode_depth, encode_png
 from robust_instant_policy.datasets.statistics import Statistics, combine, feature_statistics, image_statistics
@@ -37,6 +29,14 @@ from robust_instant_policy.datasets.tables import (
 from robust_instant_policy.datasets.video import encode_video
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.files import (
+    PART_SUFFIX,
+    finished_files,
+    lock_folder,
+    make_folder,
+    write_error,
+    write_whole,
+)
 
 EVEN_TIMING_TOLERANCE = 1e-6  # of an episode's duration
 EPISODE_FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.(?:parquet|png|mp4)$")

@@ -8,7 +8,6 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from robust_instant_policy.datasets.files import lock_folder, make_folder, write_whole
 from robust_instant_policy.evaluation.episodes import Episode, open_episodes
 from robust_instant_policy.evaluation.failures import Failure, open_failures, video_file
 from robust_instant_policy.evaluation.scenes import count_demonstrations, demonstrations_folder, obtain_demonstrations
@@ -16,6 +15,7 @@ from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.evaluation.work import Hands, Outcome, Planned, SceneWork, Setup
 from robust_instant_policy.evaluation.workbench import Workbench
+from robust_instant_policy.files import lock_folder, make_folder, write_whole
 from robust_instant_policy.policies import IMAGE_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.policies.training_picture import training_picture
@@ -103,12 +103,12 @@ def executions_left(rows: Iterable[Episode]) -> dict[Plan, int]:
 
 def plan_file(scene: Scene, variant: Variant) -> str:
     """Where, in a run's folder, a plan is kept that is to be drawn."""
-    return f"{PLAN_FOLDER}/{scene}-{variant}.json"
+    return f"{PLAN_FOLDER}/{scene}-{variant.file_name}.json"
 
 
 def training_file(task: str, variant: Variant) -> str:
     """Where, in a run's folder, a picture is kept of how a method learned ``task``."""
-    return f"{TRAINING_FOLDER}/{task}-{variant}.svg"
+    return f"{TRAINING_FOLDER}/{task}-{variant.file_name}.svg"
 
 
 def missing_work(

@@ -66,7 +66,7 @@ def open_failures(folder: Path) -> RowFile[Failure]:
 
 def video_file(scene: Scene, variant: Variant, candidate: int) -> str:
     """Where, in a run's folder, the video of an episode is kept."""
-    return f"{VIDEO_FOLDER}/{scene}-{variant}-{candidate}.mp4"
+    return f"{VIDEO_FOLDER}/{scene}-{variant.file_name}-{candidate}.mp4"
 
 
 @dataclass(frozen=True, eq=False)

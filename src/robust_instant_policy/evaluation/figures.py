@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 
 from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.summary import Summary
-from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.evaluation.variant import Scene, Variant, by_demos, labels, values
 from robust_instant_policy.policies import Plan
 
 WIDTH_IN, HEIGHT_IN = 7.0, 2.8  # of a figure over both columns of a paper
@@ -78,7 +78,7 @@ def encode(figure: Figure, form: str) -> bytes:
 def _success_bars(summary: Summary) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
     axes = figure.add_subplot()
-    _bars(axes, summary, [_style(variant) for variant in summary.variants], _names(summary.variants))
+    _bars(axes, summary, [_style(variant) for variant in summary.variants], labels(summary.variants))
     told = any(variant.method in paper.TABLE1 for variant in summary.variants)
     _legend_above(axes, "paper, with GPT-4o" if told else "", 4)
     return figure
@@ -137,12 +137,12 @@ def _demos(summary: Summary) -> Figure:
     figure = Figure(figsize=(WIDTH_IN / 1.6, HEIGHT_IN), layout="constrained")
     axes = figure.add_subplot()
     counts = sorted({variant.demos for variant in summary.variants})
-    methods = list(dict.fromkeys(variant.method for variant in summary.variants))
-    for number, method in enumerate(methods):
-        shown = sorted((one for one in summary.variants if one.method == method), key=lambda one: one.demos)
+    groups = by_demos(summary.variants)
+    for number, (label, of_count) in enumerate(groups.items()):
+        shown = [of_count[count] for count in sorted(of_count)]
         # a little apart, so that methods that do equally well can be told
-        places = [counts.index(one.demos) + 0.06 * (number - (len(methods) - 1) / 2) for one in shown]
-        _curve(axes, summary, shown, places, _style(shown[0]), method)
+        places = [counts.index(one.demos) + 0.06 * (number - (len(groups) - 1) / 2) for one in shown]
+        _curve(axes, summary, shown, places, _style(shown[0]), label)
     axes.set_xticks(range(len(counts)), [str(count) for count in counts])
     axes.set_xlabel("demonstrations shown")
     _success_axis(axes)
@@ -160,7 +160,7 @@ def _sweep(summary: Summary, label: str, value: Callable[[Variant], str]) -> Fig
         rates = [summary.rate(variant, task) for variant in summary.variants]
         known = [(place, 100 * rate.value) for place, rate in zip(places, rates, strict=True) if rate is not None]
         axes.plot(*zip(*known, strict=True), marker, color="#777777", fillstyle="none", markersize=4, label=task)
-    axes.set_xticks(places, [value(variant) for variant in summary.variants])
+    axes.set_xticks(places, values(summary.variants, value))
     axes.set_xlabel(label)
     _success_axis(axes)
     axes.legend(loc="lower right", fontsize=6.5)
@@ -246,11 +246,6 @@ def _success_axis(axes: Axes) -> None:
 
 def _style(variant: Variant) -> Style:
     return STYLES.get(variant.method, PLAIN)
-
-
-def _names(variants: Sequence[Variant]) -> list[str]:
-    methods = [variant.method for variant in variants]
-    return [one.method if methods.count(one.method) == 1 else str(one) for one in variants]
 
 
 def _dof_label(variant: Variant) -> str:

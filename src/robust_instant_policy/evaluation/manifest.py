@@ -15,10 +15,10 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from robust_instant_policy.datasets.files import write_whole
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.variant import Variant
+from robust_instant_policy.files import write_whole
 
 MANIFEST_FILE = "run.json"
 GIB = 2**30

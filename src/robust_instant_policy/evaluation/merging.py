@@ -7,13 +7,13 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from robust_instant_policy.datasets.files import finished_files, make_folder, write_whole
 from robust_instant_policy.errors import DatasetError, UsageError
 from robust_instant_policy.evaluation.episodes import Episode, open_episodes
 from robust_instant_policy.evaluation.experiment import PLAN_FOLDER, TRAINING_FOLDER, one_writer
 from robust_instant_policy.evaluation.failures import Failure, open_failures, video_file
 from robust_instant_policy.evaluation.manifest import Manifest
 from robust_instant_policy.evaluation.work import STORE_FILE
+from robust_instant_policy.files import finished_files, make_folder, write_whole
 from robust_instant_policy.llm import SampleStore
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from robust_instant_policy.datasets.files import write_whole
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.episodes import open_episodes
 from robust_instant_policy.evaluation.experiment import TRAINING_FOLDER, plan_file, wanted_plans
@@ -17,6 +16,7 @@ from robust_instant_policy.evaluation.suites import CHOSEN, Suite
 from robust_instant_policy.evaluation.summary import Summary
 from robust_instant_policy.evaluation.tables import Table, failure_table, invocation_table, tables
 from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.files import write_whole
 from robust_instant_policy.policies import Plan
 
 TABLE_FILE = "table.md"
@@ -59,7 +59,8 @@ def publish(out: Path) -> str:
 
 def _publish_suite(out: Path, summary: Summary) -> Section:
     suite = summary.suite
-    stem = suite.name if suite.objects == "seen" else f"{suite.name}-{suite.objects}"
+    kinds = [kind for kind, usual in ((suite.objects, "seen"), (suite.assets, "code")) if kind != usual]
+    stem = "-".join([suite.name, *kinds])
     figure = draw(summary, _kept_plans(out, suite))
     drawing = encode(figure, "svg")
     section = Section(suite.name, suite.objects, drawing, tables(summary))

@@ -14,8 +14,8 @@ from typing import IO, Any, Generic, Protocol, TypeVar, get_type_hints
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from robust_instant_policy.datasets.files import write_whole
 from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.files import write_whole
 
 FOLD_SECONDS = 5.0  # between two rewritings of the parquet file; rows in between are in the journal
 
@@ -101,11 +101,12 @@ class RowFile(Generic[R]):
     def _fold(self) -> None:
         if self._pending:
             new = pa.Table.from_pylist([_flat(row) for row in self._pending], schema=self._schema)
-            self._table = pa.concat_tables([self._table, new])
+            table = pa.concat_tables([self._table, new]).combine_chunks()
             buffer = io.BytesIO()
-            pq.write_table(self._table.combine_chunks(), buffer)
+            pq.write_table(table, buffer)
             write_whole(self.path, buffer.getvalue())
-            self._pending = []
+            # one statement: a row is never in both, wherever Ctrl-C or a full disk ends this
+            self._table, self._pending = table, []
             if self._journal is not None:
                 self._journal.truncate(0)
         self._folded_at = time.monotonic()

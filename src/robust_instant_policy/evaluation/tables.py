@@ -15,7 +15,7 @@ from robust_instant_policy.evaluation.failures import STAGES, Failure
 from robust_instant_policy.evaluation.manifest import Invocation
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test
 from robust_instant_policy.evaluation.summary import Rate, Summary, reference
-from robust_instant_policy.evaluation.variant import Variant
+from robust_instant_policy.evaluation.variant import Variant, by_demos, labels, values
 from robust_instant_policy.policies import METHOD_NAMES
 
 NONE = "–"
@@ -57,8 +57,8 @@ def success_table(summary: Summary) -> Table:
     for task in summary.tasks:
         head += [task, "paper"] if task in told else [task]
     rows = []
-    for variant in summary.variants:
-        row = [_name(variant, summary)]
+    for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
+        row = [label]
         for task in summary.tasks:
             row.append(_cell(summary.rate(variant, task), summary.best(task)))
             if task in told:
@@ -66,10 +66,13 @@ def success_table(summary: Summary) -> Table:
         stars = ""
         if ours is not None and variant != ours:
             own, others = _both(summary, ours, variant)
-            stars = mark(t_test(own, others)) if fmean(own) > fmean(others) else ""
+            stars = mark(t_test(own, others)) if own and fmean(own) > fmean(others) else ""
         row += [_spread(summary, variant, stars), _paper_average(variant, told)]
         rows.append(tuple(row))
-    counts = ", ".join(f"{variant.method} {_executions(summary, variant)}" for variant in summary.variants)
+    counts = ", ".join(
+        f"{label} {_executions(summary, variant)}"
+        for variant, label in zip(summary.variants, labels(summary.variants), strict=True)
+    )
     return Table(
         (*head, "average", "paper"),
         tuple(rows),
@@ -82,22 +85,23 @@ def success_table(summary: Summary) -> Table:
 def test_table(summary: Summary) -> Table | None:
     """RIP against every other method; None where there is no other."""
     ours = reference(summary.variants)
-    others = [variant for variant in summary.variants if variant != ours]
-    if ours is None or not others:
+    if ours is None or len(summary.variants) == 1:
         return None
     rows = []
-    for variant in others:
+    for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
+        if variant == ours:
+            continue
         paired = paired_test(summary.of_scenes(ours), summary.of_scenes(variant))
         own, theirs = _both(summary, ours, variant)
         rows.append(
             (
-                _name(variant, summary),
+                label,
                 f"{100 * (fmean(own) - fmean(theirs)):+.1f}" if own else NONE,
                 _p(t_test(own, theirs)),
                 str(paired.scenes),
                 str(paired.better),
                 str(paired.worse),
-                _p(paired.p),
+                _p(paired.p) if paired.scenes else NONE,
             )
         )
     head = ("rip against", "difference", "t-test p", "shared scenes", "rip better in", "worse in", "paired p")
@@ -111,7 +115,7 @@ def test_table(summary: Summary) -> Table | None:
 
 def sweep_table(summary: Summary, name: str, value: Callable[[Variant], str]) -> Table:
     """One row a task, one column a value of what is varied."""
-    head = ("task", *(f"{name} = {value(variant)}" for variant in summary.variants))
+    head = ("task", *(f"{name} = {told}" for told in values(summary.variants, value)))
     rows = [
         (task, *(_cell(summary.rate(variant, task), summary.best(task)) for variant in summary.variants))
         for task in summary.tasks
@@ -123,11 +127,9 @@ def sweep_table(summary: Summary, name: str, value: Callable[[Variant], str]) ->
 
 def demos_table(summary: Summary) -> Table:
     """One row a method, one column a number of demonstrations."""
-    methods = list(dict.fromkeys(variant.method for variant in summary.variants))
     counts = sorted({variant.demos for variant in summary.variants})
     rows = []
-    for method in methods:
-        of_count = {variant.demos: variant for variant in summary.variants if variant.method == method}
+    for label, of_count in by_demos(summary.variants).items():
         cells = []
         for count in counts:
             pooled = summary.rate(of_count[count]) if count in of_count else None
@@ -138,7 +140,7 @@ def demos_table(summary: Summary) -> Table:
             cells.append(
                 f"{_spread(summary, of_count[count])} ({100 * low:.0f} to {100 * high:.0f}, n={pooled.trials})"
             )
-        rows.append((method, *cells))
+        rows.append((label, *cells))
     return Table(
         ("method", *(f"{count} shown" for count in counts)),
         tuple(rows),
@@ -191,11 +193,6 @@ def invocation_table(invocations: Sequence[Invocation], episodes: Sequence[Episo
         if invocations
         else "Nothing is known of the commands that wrote these rows.",
     )
-
-
-def _name(variant: Variant, summary: Summary) -> str:
-    same = [other for other in summary.variants if other.method == variant.method]
-    return variant.method if len(same) == 1 else str(variant)
 
 
 def _both(summary: Summary, one: Variant, other: Variant) -> tuple[list[float], list[float]]:

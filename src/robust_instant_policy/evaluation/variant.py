@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 
 from robust_instant_policy.policies import ASKING_METHODS, DOF, REGRESSING_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import DEFAULT_STEPS
@@ -45,8 +47,14 @@ class Variant:
         for name, value in changed.items():
             object.__setattr__(self, name, value)
 
+    @property
+    def file_name(self) -> str:
+        """Everything, so that no two variants have the same."""
+        words = (str(self), "" if self.features == "auto" else self.features, self.model)
+        return re.sub(r"[^\w.-]+", "_", "-".join(word for word in words if word))
+
     def __str__(self) -> str:
-        """Everything but the model, in a few words that also make a file name."""
+        """Everything but image features and language model, in a few words."""
         dof = "" if self.dof is None else f"v{self.dof:g}"
         words = (
             self.method,
@@ -59,6 +67,35 @@ class Variant:
             "" if self.steps is None else f"{self.steps}steps",
         )
         return "-".join(word for word in words if word)
+
+
+def labels(variants: Sequence[Variant]) -> list[str]:
+    """What tells ``variants`` apart: the method and, in parentheses, the settings in which those of one method differ.
+
+    >>> labels([Variant("rip"), Variant("kat", model="a"), Variant("kat", model="b")])
+    ['rip', 'kat (model a)', 'kat (model b)']
+    """
+    told = []
+    for variant in variants:
+        same = [other for other in variants if other.method == variant.method]
+        names = [field.name for field in fields(Variant) if len({getattr(other, field.name) for other in same}) > 1]
+        settings = ", ".join(f"{name} {getattr(variant, name)}" for name in names)
+        told.append(f"{variant.method} ({settings})" if settings else variant.method)
+    return told
+
+
+def values(variants: Sequence[Variant], value: Callable[[Variant], str]) -> list[str]:
+    """The ``value`` of each where it tells them apart, else their `labels`."""
+    told = [value(variant) for variant in variants]
+    return told if len(set(told)) == len(told) else labels(variants)
+
+
+def by_demos(variants: Sequence[Variant]) -> dict[str, dict[int, Variant]]:
+    """Those that differ in nothing but how much is shown, together: label, then number of demonstrations."""
+    groups: dict[Variant, dict[int, Variant]] = {}
+    for variant in variants:
+        groups.setdefault(replace(variant, demos=0), {})[variant.demos] = variant
+    return dict(zip(labels(list(groups)), groups.values(), strict=True))
 
 
 @dataclass(frozen=True)

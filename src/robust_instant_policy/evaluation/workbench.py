@@ -171,7 +171,11 @@ class Workbench:
             def truth(instant: InstantPolicy = instant, demos: int = variant.demos) -> Truth | None:
                 if instant not in truths:
                     known = self._truth_of_demonstrations(scene.task, shown, demos)
-                    truths[instant] = true_keypoints(task, scene.seed, instant.context, shown[:demos], known)
+                    truths[instant] = (
+                        None
+                        if known is None
+                        else true_keypoints(task, scene.seed, instant.context, shown[:demos], known)
+                    )
                 return truths[instant]
 
             try:
@@ -183,15 +187,20 @@ class Workbench:
             task.reset(scene.seed)
             yield Analysis(failure, film(task, policy, observation, episode.candidate) if self._setup.films else b"")
 
-    def _truth_of_demonstrations(self, task_name: str, shown: Sequence[Demonstration], demos: int) -> list[SceneTruth]:
+    def _truth_of_demonstrations(
+        self, task_name: str, shown: Sequence[Demonstration], demos: int
+    ) -> list[SceneTruth] | None:
+        """Of each demonstration that is shown; None where one was not recorded in a scene that can be drawn again."""
+        seeds = [demonstration.seed for demonstration in shown[:demos] if demonstration.seed is not None]
+        if len(seeds) < len(shown[:demos]):
+            return None
         if len(self._shown_truth) < demos:
             apart = None if self._place[1] == "seen" else make_task(task_name, assets=self._place[2])
             task = apart or self._task
             assert task is not None
             try:
-                for demonstration in shown[len(self._shown_truth) : demos]:
-                    assert demonstration.seed is not None
-                    task.reset(demonstration.seed)
+                for seed in seeds[len(self._shown_truth) :]:
+                    task.reset(seed)
                     self._shown_truth.append(task.scene_truth())
             finally:
                 if apart is not None:

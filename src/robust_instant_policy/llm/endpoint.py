@@ -7,6 +7,8 @@ import os
 import random
 import re
 import time
+import urllib.parse
+import urllib.request
 from collections.abc import AsyncIterator, Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -77,11 +79,12 @@ class Endpoint:
 
     def client(self) -> openai.AsyncOpenAI:
         """A client that repeats nothing by itself and never takes in more than `MAX_REPLY_BYTES`."""
+        transport = _BoundedTransport(proxy=_proxy(self.url))
         return openai.AsyncOpenAI(
             base_url=self.url,
-            api_key=os.environ.get(KEY_VARIABLE) or "none",
+            api_key=_key() or "none",
             max_retries=0,
-            http_client=httpx2.AsyncClient(transport=_BoundedTransport(), headers={"Accept-Encoding": "identity"}),
+            http_client=httpx2.AsyncClient(transport=transport, headers={"Accept-Encoding": "identity"}),
         )
 
     async def facts(self, client: openai.AsyncOpenAI) -> ServerFacts:
@@ -237,7 +240,7 @@ class _Plan:
                         for index in range(len(self._queries)):
                             group.create_task(self._fill(client, index))
                 except* ModelError as errors:
-                    failure = next(error for error in errors.exceptions if isinstance(error, ModelError))
+                    failure = _first(errors)
         except TimeoutError:
             pass
         if failure is not None:
@@ -339,12 +342,36 @@ class _BoundedStream(httpx2.AsyncByteStream):
 
 def scrubbed(words: str, length: int = 200) -> str:
     """A message for the user: one short line, without anything that looks like a key."""
-    key = os.environ.get(KEY_VARIABLE)
+    key = os.environ.get(KEY_VARIABLE, "").strip()
     if key:
         words = words.replace(key, "***")
     words = re.sub(r"\b(sk|key)-[\w*-]{4,}", "***", words)
     words = " ".join(words.split())
     return words if len(words) <= length else words[:length] + "…"
+
+
+def _key() -> str:
+    """The key, without the line break that files and pipes leave behind it; raises `ModelError` where it is none."""
+    key = os.environ.get(KEY_VARIABLE, "").strip()
+    if not (key.isascii() and key.isprintable()):
+        raise ModelError(f"{KEY_VARIABLE} holds characters that no key has; set it to the key alone")
+    return key
+
+
+def _proxy(url: str) -> str | None:
+    """The proxy that the environment names for ``url``; none for this machine itself."""
+    parts = urllib.parse.urlsplit(url)
+    host = parts.hostname or ""
+    if host == "localhost" or host.startswith("127.") or host == "::1" or urllib.request.proxy_bypass(host):
+        return None
+    proxies = urllib.request.getproxies()
+    return proxies.get(parts.scheme) or proxies.get("all")
+
+
+def _first(errors: BaseExceptionGroup[ModelError]) -> ModelError:
+    """The first of the errors in a group, however deep groups are nested."""
+    first = errors.exceptions[0]
+    return _first(first) if isinstance(first, BaseExceptionGroup) else first
 
 
 def _refusal(endpoint: Endpoint, error: openai.APIStatusError) -> str:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import Trajectory
 
@@ -100,7 +101,7 @@ class Plan:
     notes: tuple[str, ...] = ()
 
     def save(self, path: str | Path) -> None:
-        """Write the plan as JSON."""
+        """Write the plan as JSON, whole or not at all. Raises `DatasetError` when that is not possible."""
         content = {
             "format": PLAN_FORMAT,
             "trajectory": _to_json(self.trajectory),
@@ -110,7 +111,7 @@ class Plan:
             "usage": [vars(stage) for stage in self.usage.stages],
             "notes": list(self.notes),
         }
-        Path(path).write_text(json.dumps(content, allow_nan=False) + "\n")
+        write_whole(Path(path), (json.dumps(content, allow_nan=False) + "\n").encode())
 
     @classmethod
     def load(cls, path: str | Path) -> Plan:

@@ -110,7 +110,7 @@ def confidence(standard_error: FloatArray, weights: FloatArray, tolerance: float
     """
     if np.isinf(standard_error).any():
         return 0.0
-    worst = np.maximum(standard_error.max(axis=1), np.finfo(float).tiny)
+    worst = np.maximum(standard_error.max(axis=1), np.finfo(float).eps * tolerance)
     freedom = error_freedom(effective_count(weights))
     within = fdtr(COORDINATES, freedom, (tolerance / worst) ** 2 / COORDINATES)
     return float((within * np.minimum(1.0, weights.mean(axis=0) / MAJORITY)).min())

@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from robust_instant_policy.datasets import layout
 from robust_instant_policy.datasets.importers.hdf5 import open_hdf5
 from robust_instant_policy.datasets.importers.lerobot import read_lerobot
 from robust_instant_policy.datasets.importers.maniskill import read_maniskill
 from robust_instant_policy.datasets.importers.robomimic import read_robomimic
 from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode
+from robust_instant_policy.datasets.reader import load_demonstrations
 from robust_instant_policy.datasets.writer import DatasetWriter
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
+
+SAME_M = 1e-5  # poses are kept as float32
 
 
 def import_demonstrations(path: str | Path, task: str, rig: Rig) -> list[Demonstration]:
@@ -28,21 +33,34 @@ def import_demonstrations(path: str | Path, task: str, rig: Rig) -> list[Demonst
 def convert_demonstrations(path: str | Path, out: str | Path, task: str, description: str, rig: Rig) -> int:
     """Write what `import_demonstrations` reads into a demonstrations folder, with the images along the way.
 
-    Goes on where an earlier call was interrupted. Returns the number of demonstrations in the folder.
+    Goes on where an earlier call was interrupted, and adds to what other recordings gave. Returns the number of
+    demonstrations in the folder.
     Raises `DatasetError` as `import_demonstrations` and `DatasetWriter` do.
     """
     writer = None
     try:
-        for number, episode in enumerate(_read_episodes(Path(path), rig)):
+        there: list[Demonstration] = []
+        for episode in _read_episodes(Path(path), rig):
             demonstration = episode.demonstration(task, rig.triangle)
             if writer is None:
                 writer = DatasetWriter(out, task, description, demonstration.rate_hz)
-            if number >= writer.num_episodes:
+                there = load_demonstrations(out, task=task) if writer.num_episodes else []
+            if not any(_same(demonstration, other) for other in there):
                 writer.add(demonstration, None if episode.images is None else episode.images())
         return 0 if writer is None else writer.num_episodes
     finally:
         if writer is not None:
             writer.close()
+
+
+def _same(one: Demonstration, other: Demonstration) -> bool:
+    """Whether both come from the same episode; files of one name may hold different ones."""
+    actions = one.trajectory.actions, other.trajectory.actions
+    return (
+        all(one.info.get(name) == other.info.get(name) for name in ("source", "episode"))
+        and actions[0].shape == actions[1].shape
+        and np.allclose(*actions, rtol=0, atol=SAME_M)
+    )
 
 
 def _read_episodes(path: Path, rig: Rig) -> Iterator[SourceEpisode]:

@@ -14,8 +14,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
 from torch import Tensor
 
-from robust_instant_policy.datasets.files import write_whole
 from robust_instant_policy.errors import ModelError
+from robust_instant_policy.files import write_whole
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

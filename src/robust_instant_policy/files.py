@@ -21,7 +21,7 @@ def write_whole(path: Path, content: bytes) -> None:
     The content goes to a hidden neighbour, to the disk itself, and only then takes its name.
     Raises `DatasetError` when it cannot be written; the old content then still stands.
     """
-    part = path.with_name(f".{path.name}{PART_SUFFIX}")
+    part = path.with_name(f".{path.name}.{os.getpid()}{PART_SUFFIX}")
     try:
         make_folder(path.parent)
         with part.open("wb") as file:
