@@ -226,8 +226,8 @@ def test_the_table_counts_every_execution_marks_the_best_and_shows_the_papers_nu
     rows = [episode(RIP, seed, True) for seed in range(4)]
     rows += [episode(KAT, seed, candidate < 2, candidate, of=5) for seed in range(4) for candidate in range(5)]
     success, tests = (table.markdown() for table in tables(Summary(suite, rows)))
-    assert "| rip | **100** (51 to 100) | 100 | 100 ± 0 | 100 ± 0 |" in success
-    assert "| kat | 40 (22 to 61) | 74 | 40 ± 0 | 74 ± 0 |" in success
+    assert "| rip | **100** (51 to 100) | 100 | 100.0 ± 0.0 | 100 ± 0 |" in success
+    assert "| kat | 40 (22 to 61) | 74 | 40.0 ± 0.0 | 74 ± 0 |" in success
     assert "| kat | +60.0 | – | 4 | 4 | 0 | 0.125 |" in tests
 
 
@@ -275,7 +275,7 @@ def test_variants_that_differ_in_the_model_only_are_told_apart_everywhere():
     shown = [replace(variant, demos=demos) for variant in two for demos in (1, 3)]
     suite = Suite("demos", ("push-cube",), tuple(shown), (0,))
     (table,) = tables(Summary(suite, [episode(variant, 0, variant.model == "gpt-4o") for variant in shown]))
-    assert [(row[0], row[1][:3].strip()) for row in table.rows] == [(labels(two)[0], "100"), (labels(two)[1], "0 ±")]
+    assert [(row[0], row[1][:3].strip()) for row in table.rows] == [(labels(two)[0], "100"), (labels(two)[1], "0.0")]
 
 
 def test_a_run_remembers_its_suites_and_the_commands_that_made_it(tmp_path):

@@ -103,7 +103,11 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     evaluate.add_argument("--tasks", nargs="+", metavar="TASK", help="default: push-cube, or those of the suite")
     evaluate.add_argument(
-        "--methods", nargs="+", metavar="METHOD", help="default: rip rip-gauss kat, or those of the suite"
+        "--methods",
+        nargs="+",
+        metavar="METHOD",
+        help="of rip rip-gauss rip-adaptive kat dp kat-dp neighbours gp "
+        "(default: rip rip-gauss kat, or those of the suite)",
     )
     evaluate.add_argument("--demos", type=_positive, default=10, metavar="N")
     evaluate.add_argument("--episodes", type=_positive, default=10, metavar="N", help="scenes (default: %(default)s)")

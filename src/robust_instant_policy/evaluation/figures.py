@@ -6,19 +6,24 @@ import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from textwrap import fill
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.summary import Summary
 from robust_instant_policy.evaluation.variant import Scene, Variant, by_demos, labels, values
 from robust_instant_policy.policies import Plan
 
+AVERAGE = "average"
+GROUPS_A_ROW = 7  # of bars
 WIDTH_IN, HEIGHT_IN = 7.0, 2.8  # of a figure over both columns of a paper
 LINE_CHARACTERS = 75  # that fit below such a figure, side by side
 PNG_DPI = 200
@@ -76,22 +81,29 @@ def encode(figure: Figure, form: str) -> bytes:
 
 
 def _success_bars(summary: Summary) -> Figure:
-    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
-    axes = figure.add_subplot()
-    _bars(axes, summary, [_style(variant) for variant in summary.variants], labels(summary.variants))
-    told = any(variant.method in paper.TABLE1 for variant in summary.variants)
-    _legend_above(axes, "paper, with GPT-4o" if told else "", 4)
+    groups = [*summary.tasks, AVERAGE]
+    num_rows = -(-len(groups) // GROUPS_A_ROW)
+    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN * num_rows), layout="constrained")
+    bounds = [len(groups) * row // num_rows for row in range(num_rows + 1)]
+    styles = [_style(variant) for variant in summary.variants]
+    for row in range(num_rows):
+        axes = figure.add_subplot(num_rows, 1, row + 1)
+        _bars(axes, summary, groups[bounds[row] : bounds[row + 1]], styles)
+        if row == 0:
+            told = any(variant.method in paper.TABLE1 for variant in summary.variants)
+            _legend_above(axes, styles, labels(summary.variants), "paper, with GPT-4o" if told else "", 4)
     return figure
 
 
-def _bars(axes: Axes, summary: Summary, styles: Sequence[Style], labels: Sequence[str]) -> None:
-    """One group of bars a task and one for their average; whiskers are Wilson's 95% interval, over tasks ± 1 sd."""
-    groups = [*summary.tasks, "average"]
+def _bars(axes: Axes, summary: Summary, groups: Sequence[str], styles: Sequence[Style]) -> None:
+    """One group of bars for each of ``groups``, tasks or their average; whiskers are Wilson's 95% interval, over tasks
+    ± 1 sd.
+    """
     width = 0.84 / len(summary.variants)
     for index, (variant, style) in enumerate(zip(summary.variants, styles, strict=True)):
         offset = (index - (len(summary.variants) - 1) / 2) * width
-        for group, task in enumerate(groups):
-            if task == "average":
+        for place, task in enumerate(groups):
+            if task == AVERAGE:
                 mean, deviation = summary.over_tasks(variant)
                 low, high = max(0.0, mean - deviation), min(1.0, mean + deviation)
             else:
@@ -100,23 +112,31 @@ def _bars(axes: Axes, summary: Summary, styles: Sequence[Style], labels: Sequenc
                     continue
                 mean, (low, high) = rate.value, rate.interval
             axes.bar(
-                group + offset,
+                place + offset,
                 100 * mean,
                 width,
                 color=style.colour,
                 edgecolor="black",
                 linewidth=0.5,
                 hatch=style.hatch,
-                label=labels[index] if task == "average" else None,
             )
             whisker = 100 * np.array([[max(0.0, mean - low)], [max(0.0, high - mean)]])
-            axes.errorbar(group + offset, 100 * mean, whisker, color="black", linewidth=0.7, capsize=1.5)
-            told = paper.table1(variant.method, task)
+            axes.errorbar(place + offset, 100 * mean, whisker, color="black", linewidth=0.7, capsize=1.5)
+            told = _paper_percent(summary, variant, task)
             if told is not None and summary.suite.name != "downsampling":
-                _told(axes, group + offset, width, told)
+                _told(axes, place + offset, width, told)
     room = max(8, LINE_CHARACTERS // len(groups))  # names break at their hyphens
     axes.set_xticks(range(len(groups)), [fill(group, room) for group in groups])
     _success_axis(axes)
+
+
+def _paper_percent(summary: Summary, variant: Variant, group: str) -> float | None:
+    """The paper's number for a task, or its average over the tasks that ``variant`` was tried in here."""
+    if group != AVERAGE:
+        return paper.table1(variant.method, group)
+    tried = [task for task in summary.tasks if summary.rate(variant, task) is not None]
+    known = [told for task in tried if (told := paper.table1(variant.method, task)) is not None]
+    return fmean(known) if len(known) == len(tried) else None
 
 
 def _told(axes: Axes, centre: float, width: float, percent: float) -> None:
@@ -126,8 +146,11 @@ def _told(axes: Axes, centre: float, width: float, percent: float) -> None:
     axes.plot(ends, [percent, percent], color="black", linewidth=1.6, solid_capstyle="butt", zorder=5)
 
 
-def _legend_above(axes: Axes, told: str, columns: int) -> None:
-    handles, _ = axes.get_legend_handles_labels()
+def _legend_above(axes: Axes, styles: Sequence[Style], names: Sequence[str], told: str, columns: int) -> None:
+    handles: list[Artist] = [
+        Patch(facecolor=style.colour, edgecolor="black", linewidth=0.5, hatch=style.hatch, label=name)
+        for style, name in zip(styles, names, strict=True)
+    ]
     if told:
         handles.append(Line2D([], [], color="black", linewidth=1.6, label=told))
     axes.legend(handles=handles, ncols=columns, loc="lower center", bbox_to_anchor=(0.5, 1.0))
@@ -185,12 +208,14 @@ def _downsampling(summary: Summary) -> Figure:
     ways = [variant.downsampling for variant in summary.variants]
     looks = {"uniform": STYLES["dp"], "masked": STYLES["rip"]}
     names = {"uniform": "normal (uniform)", "masked": "gripper-based (masked)"}
-    _bars(axes, summary, [looks[way] for way in ways], [names[way] for way in ways])
+    groups = [*summary.tasks, AVERAGE]
+    styles = [looks[way] for way in ways]
+    _bars(axes, summary, groups, styles)
     width = 0.84 / len(ways)
     for index, way in enumerate(ways):
         centre = len(summary.tasks) + (index - (len(ways) - 1) / 2) * width
         _told(axes, centre, width, paper.DOWNSAMPLING[way])
-    _legend_above(axes, "paper, average of 5 tasks", 2)
+    _legend_above(axes, styles, [names[way] for way in ways], "paper, average of 5 tasks", 2)
     return figure
 
 

@@ -67,7 +67,8 @@ def success_table(summary: Summary) -> Table:
         if ours is not None and variant != ours:
             own, others = _both(summary, ours, variant)
             stars = mark(t_test(own, others)) if own and fmean(own) > fmean(others) else ""
-        row += [_spread(summary, variant, stars), _paper_average(variant, told)]
+        tried = [task for task in told if summary.rate(variant, task) is not None]
+        row += [_spread(summary, variant, stars), _paper_average(variant, tried)]
         rows.append(tuple(row))
     counts = ", ".join(
         f"{label} {_executions(summary, variant)}"
@@ -77,8 +78,9 @@ def success_table(summary: Summary) -> Table:
         (*head, "average", "paper"),
         tuple(rows),
         "Success in percent; in parentheses Wilson's 95% interval; the best of a task is bold. Averages are mean ± "
-        "standard deviation over tasks; RIP is significantly better than those marked \\* or \\*\\* (t-test as in the "
-        f"paper, p < 0.05 and p < 0.005). Executions a task: {counts}.",
+        "standard deviation over the tasks that the method was tried in, the paper's over the same; RIP is "
+        "significantly better than those marked \\* or \\*\\* (t-test as in the paper, p < 0.05 and p < 0.005). "
+        f"Executions a task: {counts}.",
     )
 
 
@@ -210,7 +212,7 @@ def _cell(rate: Rate | None, best: float) -> str:
 
 def _spread(summary: Summary, variant: Variant, stars: str = "") -> str:
     mean, deviation = summary.over_tasks(variant)
-    return f"{100 * mean:.0f}{stars.replace('*', chr(92) + '*')} ± {100 * deviation:.0f}"
+    return f"{100 * mean:.1f}{stars.replace('*', chr(92) + '*')} ± {100 * deviation:.1f}"
 
 
 def _percent(value: int | None) -> str:
