@@ -2,6 +2,7 @@
 
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -48,6 +49,21 @@ def test_wrong_usage_is_told_in_one_line(arguments, status, words, capsys, tmp_p
     code, line = refused(arguments, capsys)
     assert code == status
     assert words in line
+
+
+def test_what_belongs_to_something_else_is_refused_and_left_alone(tmp_path, capsys):
+    np.save(tmp_path / "one-array.npy", np.zeros(3))
+    code, line = refused(["plan", "--demos", "absent", "--observation", str(tmp_path / "one-array.npy")], capsys)
+    assert (code, "not an .npz" in line) == (1, True)
+    with sqlite3.connect(tmp_path / "bookmarks.sqlite") as bookmarks:
+        bookmarks.execute("CREATE TABLE bookmarks (address TEXT)")
+    before = (tmp_path / "bookmarks.sqlite").read_bytes()
+    code, line = refused(["samples", str(tmp_path / "bookmarks.sqlite")], capsys)
+    assert (code, "something else" in line) == (2, True)
+    assert (tmp_path / "bookmarks.sqlite").read_bytes() == before
+    (tmp_path / "episodes.parquet").touch()
+    code, line = refused(["demo", "--out", str(tmp_path)], capsys)
+    assert (code, "holds an evaluation" in line) == (2, True)
 
 
 def test_a_missing_or_empty_demonstrations_folder_is_told(workbench, tmp_path, monkeypatch, capsys):

@@ -184,14 +184,13 @@ def test_robomimic_files_become_demonstrations(tmp_path):
 
 
 def test_two_robomimic_files_make_one_folder_and_none_of_their_episodes_is_lost_or_doubled(tmp_path):
-    (tmp_path / "other").mkdir()
-    first = robomimic_file(tmp_path / "lift.hdf5")
-    second = robomimic_file(tmp_path / "other" / "lift.hdf5")  # of the same name, with other motions
-    with h5py.File(second, "r+") as file:
-        for episode in file["data"].values():
-            episode["obs/robot0_eef_pos"][...] += 0.1
+    first, second = (robomimic_file(tmp_path / name) for name in ("lift.hdf5", "more.hdf5"))
+    out = tmp_path / "lift"
     for path, count in ((first, 4), (second, 8), (first, 8), (second, 8)):
-        assert convert_demonstrations(path, tmp_path / "lift", TASK, "lift it", Rig(TRIANGLE)) == count
+        assert convert_demonstrations(path, out, TASK, "lift it", Rig(TRIANGLE)) == count
+    message = refusal(convert_demonstrations, first, out, TASK, "lift it", Rig(GripperTriangle(0.2, 0.08)))
+    assert "converted with another rig" in message
+    assert len(load_demonstrations(out)) == 8
 
 
 def test_what_a_robomimic_file_lacks_is_said_and_what_is_known_can_be_given(tmp_path):

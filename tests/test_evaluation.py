@@ -1,5 +1,6 @@
 """Rows, statistics and tables; what workers do is in test_evaluation_workers.py."""
 
+import json
 import math
 import re
 from contextlib import closing
@@ -139,6 +140,16 @@ def test_a_kill_at_any_moment_loses_no_row(tmp_path):
     again.add(episode(RIP, 3, True))
     again.close()
     assert len(open_episodes(tmp_path).rows) == 4
+
+
+def test_the_journal_of_an_older_version_is_read_like_its_table(tmp_path):
+    table = open_episodes(tmp_path)
+    table.add(episode(KAT, 0, True))
+    journal = tmp_path / "episodes.journal"
+    entry = json.loads(journal.read_text())
+    del entry["assets"]
+    journal.write_text(json.dumps(entry) + "\n")
+    assert open_episodes(tmp_path).rows == [episode(KAT, 0, True)]
 
 
 def test_reading_the_rows_of_a_run_under_way_changes_nothing_on_disk(tmp_path):

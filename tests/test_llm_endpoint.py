@@ -283,6 +283,14 @@ def test_the_environments_proxy_is_used_for_other_machines_only(proxy, monkeypat
     assert len(between.seen) == seen
 
 
+@pytest.mark.parametrize("proxy_line", ["user:pa55word@127.0.0.1:9", "socks9://user:pa55word@127.0.0.1:9"])
+def test_a_proxy_that_cannot_be_used_is_told_without_its_password(monkeypatch, proxy_line):
+    monkeypatch.setenv("https_proxy", proxy_line)
+    with pytest.raises(ModelError, match=r"llm\.example\.invalid") as caught:
+        connect("https://llm.example.invalid/v1#m").sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30))
+    assert "pa55word" not in str(caught.value)
+
+
 def test_it_works_where_an_event_loop_is_running(server):
     async def notebook() -> int:
         return len(connect(f"{server}/v1#anything").sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=60))[0])

@@ -349,16 +349,21 @@ def _merge(options: argparse.Namespace) -> int:
 def _view(options: argparse.Namespace) -> int:
     from robust_instant_policy.datasets.page import write_page
 
-    print(write_page(options.demos, options.out or options.demos.with_name(options.demos.name + ".html")))
+    print(write_page(options.demos, options.out or _beside(options.demos, ".html")))
     return 0
 
 
 def _keypoints(options: argparse.Namespace) -> int:
     from robust_instant_policy.keypoints import show_keypoints
 
-    out = options.out or options.demos.with_name(options.demos.name + "-keypoints.html")
+    out = options.out or _beside(options.demos, "-keypoints.html")
     show_keypoints(options.demos, options.features, options.scenes, options.noise, options.seed, out)
     return 0
+
+
+def _beside(folder: Path, ending: str) -> Path:
+    named = folder if folder.name and folder.name != ".." else folder.resolve()
+    return named.with_name(named.name + ending)
 
 
 def _samples(options: argparse.Namespace) -> int:

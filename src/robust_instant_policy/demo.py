@@ -11,7 +11,7 @@ import numpy as np
 from robust_instant_policy.console import StageConsole
 from robust_instant_policy.datasets import VideoWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
-from robust_instant_policy.errors import UnreachableError
+from robust_instant_policy.errors import UnreachableError, UsageError
 from robust_instant_policy.evaluation import obtain_demonstrations, scene_seed
 from robust_instant_policy.llm import connect
 from robust_instant_policy.policies import InstantPolicy, RobustInstantPolicy
@@ -34,6 +34,8 @@ def run_demo(
 
     ``demonstrations`` is a number, recorded into ``data/TASK`` where they are missing, or a folder.
     """
+    if any(out.glob("episodes.*")):
+        raise UsageError(f"{out} holds an evaluation; give the demo another folder with --out")
     screen = StageConsole()
     scene = scene_seed(seed, 0)
     screen.say(f"{task_name}: the robot is shown the task, then does it in a scene it has not seen (number {scene})")

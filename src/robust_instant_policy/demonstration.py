@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from tokenize import TokenError
 from types import MappingProxyType
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from robust_instant_policy.errors import DatasetError, InvalidValueError
@@ -59,7 +62,10 @@ class Observation:
         """Read an ``.npz`` file that holds arrays named like the fields; raises `DatasetError` in one line."""
         names = ("rgb", "depth", "intrinsics", "camera_pose")
         try:
-            with np.load(path, allow_pickle=False) as arrays:
+            loaded = np.load(path, allow_pickle=False)
+            if not isinstance(loaded, NpzFile):
+                raise ValueError
+            with loaded as arrays:
                 missing = [name for name in names if name not in arrays]
                 if missing:
                     raise DatasetError(
@@ -70,7 +76,7 @@ class Observation:
             raise DatasetError(f"no observation at {path}") from None
         except InvalidValueError as error:
             raise DatasetError(f"{path}: {error}") from None
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, TokenError):
             raise DatasetError(f"{path} is not an .npz file with {', '.join(names)}") from None
 
     def save(self, path: str | Path) -> None:

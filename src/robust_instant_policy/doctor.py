@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from robust_instant_policy.errors import RipError
-
 NEEDED_DISK_GB = 2.0  # datasets, runs and the assembled model
 NEEDED_MEMORY_GB = 4.0  # peak of `rip demo`
 RENDERER_TIMEOUT_S = 120
@@ -96,8 +94,8 @@ def _tried(name: str, simulator: str, extra: str, module: str, remedy: str) -> F
 def _attempt(name: str, probe: Callable[[], str], remedy: str) -> Finding:
     try:
         return Finding(name, True, probe())
-    except RipError as error:
-        return Finding(name, False, str(error), remedy)
+    except Exception as error:  # whatever is wrong, the rest is looked at, too
+        return Finding(name, False, str(error) or type(error).__name__, remedy)
 
 
 def _embedded_model() -> str:

@@ -58,20 +58,22 @@ summary{cursor:pointer;margin:.6em 0}
 
 @dataclass(frozen=True)
 class Section:
-    """One suite: its name, whether objects are "seen" or "unseen", its figure as SVG and its tables."""
+    """One suite: its name, the ``kinds`` of its objects where they are not the usual ones, its figure as SVG and its
+    tables.
+    """
 
     name: str
-    objects: str
+    kinds: tuple[str, ...]
     figure: bytes
     tables: Sequence[Table]
 
     @property
     def title(self) -> str:
-        return TITLES[self.name] + ("" if self.objects == "seen" else f" ({self.objects} objects)")
+        return TITLES[self.name] + (f" ({', '.join(self.kinds)} objects)" if self.kinds else "")
 
     @property
     def anchor(self) -> str:
-        return f"{self.name}-{self.objects}"
+        return "-".join((self.name, *self.kinds))
 
 
 def write_page(

@@ -59,11 +59,11 @@ def publish(out: Path) -> str:
 
 def _publish_suite(out: Path, summary: Summary) -> Section:
     suite = summary.suite
-    kinds = [kind for kind, usual in ((suite.objects, "seen"), (suite.assets, "code")) if kind != usual]
-    stem = "-".join([suite.name, *kinds])
+    kinds = tuple(kind for kind, usual in ((suite.objects, "seen"), (suite.assets, "code")) if kind != usual)
     figure = draw(summary, _kept_plans(out, suite))
     drawing = encode(figure, "svg")
-    section = Section(suite.name, suite.objects, drawing, tables(summary))
+    section = Section(suite.name, kinds, drawing, tables(summary))
+    stem = section.anchor
     write_whole(out / f"{stem}.svg", drawing)
     write_whole(out / f"{stem}.png", encode(figure, "png"))
     if section.tables:

@@ -137,10 +137,11 @@ class RowFile(Generic[R]):
             lines = self._journal_path.read_text(encoding="utf-8").splitlines()
         except FileNotFoundError:
             return rows
+        known = _defaults(self._kind)
         for line in lines:
             try:
-                rows.append(self._row(json.loads(line)))
-            except (ValueError, KeyError):
+                rows.append(self._row(known | json.loads(line)))
+            except (ValueError, KeyError, TypeError):
                 break
         return rows
 

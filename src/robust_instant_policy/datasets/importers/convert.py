@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +33,8 @@ def import_demonstrations(path: str | Path, task: str, rig: Rig) -> list[Demonst
 def convert_demonstrations(path: str | Path, out: str | Path, task: str, description: str, rig: Rig) -> int:
     """Write what `import_demonstrations` reads into a demonstrations folder, with the images along the way.
 
-    Goes on where an earlier call was interrupted, and adds to what other recordings gave. Returns the number of
-    demonstrations in the folder.
+    Goes on where an earlier call was interrupted, and adds to what recordings of other names gave. Returns the number
+    of demonstrations in the folder.
     Raises `DatasetError` as `import_demonstrations` and `DatasetWriter` do.
     """
     writer = None
@@ -45,7 +45,7 @@ def convert_demonstrations(path: str | Path, out: str | Path, task: str, descrip
             if writer is None:
                 writer = DatasetWriter(out, task, description, demonstration.rate_hz)
                 there = load_demonstrations(out, task=task) if writer.num_episodes else []
-            if not any(_same(demonstration, other) for other in there):
+            if _is_new(demonstration, there, writer.path):
                 writer.add(demonstration, None if episode.images is None else episode.images())
         return 0 if writer is None else writer.num_episodes
     finally:
@@ -53,14 +53,18 @@ def convert_demonstrations(path: str | Path, out: str | Path, task: str, descrip
             writer.close()
 
 
-def _same(one: Demonstration, other: Demonstration) -> bool:
-    """Whether both come from the same episode; files of one name may hold different ones."""
-    actions = one.trajectory.actions, other.trajectory.actions
-    return (
-        all(one.info.get(name) == other.info.get(name) for name in ("source", "episode"))
-        and actions[0].shape == actions[1].shape
-        and np.allclose(*actions, rtol=0, atol=SAME_M)
-    )
+def _is_new(demonstration: Demonstration, there: Iterable[Demonstration], out: Path) -> bool:
+    """Whether no episode of its name is among those ``there``; `DatasetError` where one is that differs."""
+    for other in there:
+        if all(demonstration.info.get(name) == other.info.get(name) for name in ("source", "episode")):
+            actions = demonstration.trajectory.actions, other.trajectory.actions
+            if actions[0].shape == actions[1].shape and np.allclose(*actions, rtol=0, atol=SAME_M):
+                return False
+            raise DatasetError(
+                f"{out} holds another {other.info['source']} {other.info['episode']}, converted with another rig or "
+                "from another file of that name; choose a new folder, or give the file another name"
+            )
+    return True
 
 
 def _read_episodes(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
