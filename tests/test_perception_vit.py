@@ -233,6 +233,12 @@ def test_a_checkpoint_that_does_not_fit_says_which_tensors(vit_folder, tmp_path)
     assert "encoder.layer.3.output.dense.bias is missing" in str(error.value)
     assert "encoder.layer.1.layernorm_before.weight is (7,) instead of (48,)" in str(error.value)
     assert "\n" not in str(error.value)
+    pointer, training = tmp_path / "pointer.pth", tmp_path / "training.pth"
+    pointer.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:abc\nsize 1\n")
+    torch.save({"teacher": {"weight": torch.zeros(1)}, "epoch": 3}, training)
+    for path, words in ((pointer, "is it whole"), (training, "other things than tensors")):
+        with pytest.raises(ModelError, match=words):
+            load_checkpoint(str(path))
 
 
 def test_a_model_of_another_kind_is_refused_by_name(vit_folder, tmp_path):

@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -84,6 +85,15 @@ def test_a_damaged_plan_is_refused_in_one_line(tmp_path):
         (tmp_path / "plan.json").write_text(content)
         with pytest.raises(DatasetError, match=r"plan\.json"):
             Plan.load(tmp_path / "plan.json")
+
+
+@pytest.mark.parametrize("value", ["NaN", '"high"', "1.5", "true or false"])
+def test_a_plan_whose_confidence_is_no_confidence_is_refused(tmp_path, plan, value):
+    plan.save(tmp_path / "plan.json")
+    text = (tmp_path / "plan.json").read_text()
+    (tmp_path / "plan.json").write_text(re.sub('"confidence": [^,]+', f'"confidence": {value}', text))
+    with pytest.raises(DatasetError, match=r"plan\.json is not a plan"):
+        Plan.load(tmp_path / "plan.json")
 
 
 def test_the_report_tells_the_whole_story_without_the_network(run_folder):

@@ -235,9 +235,16 @@ def _tensors(path: Path) -> dict[str, Any]:
     try:
         if path.suffix == ".safetensors":
             return load_file(path)
-        return torch.load(path, map_location="cpu", weights_only=True)
+        tensors = torch.load(path, map_location="cpu", weights_only=True)
     except (SafetensorError, OSError, RuntimeError, ValueError, EOFError) as error:
         raise ModelError(f"{path} cannot be read as weights: {str(error).splitlines()[0]}") from error
+    except Exception as error:  # torch's own for a file that is none, an unfinished download for instance
+        raise ModelError(f"{path} cannot be read as weights; is it whole?") from error
+    if not isinstance(tensors, dict) or not all(isinstance(value, torch.Tensor) for value in tensors.values()):
+        raise ModelError(
+            f"{path} holds other things than tensors by name, like a checkpoint of a training; export those"
+        )
+    return tensors
 
 
 def _configuration(path: Path, tensors: Mapping[str, Tensor], told: Mapping[str, Any]) -> VitConfig:

@@ -117,19 +117,21 @@ class Plan:
     def load(cls, path: str | Path) -> Plan:
         """Read a plan written by `save`; raises `DatasetError` in one line."""
         try:
-            content = json.loads(Path(path).read_text())
+            content = json.loads(Path(path).read_text(), parse_constant=_no_number)
             if content["format"] != PLAN_FORMAT:
                 raise DatasetError(f"{path} has plan format {content['format']}, this version reads {PLAN_FORMAT}")
             return cls(
                 trajectory=_from_json(content["trajectory"]),
                 candidates=tuple(_from_json(candidate) for candidate in content["candidates"]),
-                confidence=content["confidence"],
+                confidence=_checked_confidence(content["confidence"]),
                 usage=Usage(tuple(Stage(**stage) for stage in content["usage"])),
                 notes=tuple(content["notes"]),
                 **{name: np.array(content[name], dtype=dtype) for name, dtype in _ARRAYS.items()},
             )
         except FileNotFoundError:
             raise DatasetError(f"no plan at {path}") from None
+        except OSError as error:
+            raise DatasetError(f"{path} cannot be read: {error.strerror}") from None
         except (KeyError, TypeError, ValueError, InvalidValueError) as error:
             raise DatasetError(f"{path} is not a plan: {error}") from None
 
@@ -144,6 +146,16 @@ _ARRAYS: dict[str, type] = {
     "pixels": np.float64,
     "keypoint_confidence": np.float64,
 }
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"it holds {word} in place of a number")
+
+
+def _checked_confidence(value: float | None) -> float | None:
+    if value is not None and not (isinstance(value, int | float) and 0.0 <= value <= 1.0):
+        raise ValueError(f"its confidence is {value!r}, not a number from 0 to 1")
+    return value
 
 
 def _to_json(trajectory: Trajectory) -> dict[str, list]:
