@@ -88,6 +88,7 @@ def test_a_last_row_cut_off_is_left_out():
 
 def test_a_broken_row_in_the_middle_spoils_the_answer():
     assert read_rows("1 2 3\n4 5\n7 8 9", 3) is None
+    assert read_rows("For instance:\n1 2 3\nSo here it is:\n4 5 6", 3) is None
 
 
 def test_the_pattern_of_rows_holds_states_to_zero_and_one():

@@ -81,6 +81,12 @@ def test_masked_downsampling_keeps_ends_and_both_sides_of_every_gripper_change(l
     assert (np.diff(steps) > 0).all()
 
 
+def test_a_grasp_that_is_measured_as_it_closes_is_kept_too():
+    actions = np.random.default_rng(0).normal(size=(200, 10))
+    actions[:, STATE_INDEX] = np.clip((np.arange(200) - 150) / 4, 0, 1)
+    assert {152, 153} <= set(masked_steps(Trajectory.from_actions(actions)))
+
+
 def test_downsampling_reaches_the_paper_length():
     trajectory = grasping(330, [100, 250])
     assert len(masked_steps(trajectory)) == 30

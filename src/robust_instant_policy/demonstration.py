@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -15,8 +16,11 @@ from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import Trajectory
+
+FARTHEST_CAMERA_M = 50.0  # from the origin of the world; farther, it is not in metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +38,14 @@ class Observation:
     camera_pose: FloatArray
 
     def __post_init__(self) -> None:
-        rgb = np.asarray(self.rgb)
+        rgb = np.array(self.rgb)  # a copy: a camera's driver may write the next image into the same memory
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
             raise InvalidValueError(f"rgb must be (H, W, 3) uint8, got {rgb.shape} {rgb.dtype}")
-        depth = np.asarray(self.depth, dtype=np.float32)
+        depth = np.array(self.depth, dtype=np.float32)
         if depth.shape != rgb.shape[:2]:
             raise InvalidValueError(f"depth must be {rgb.shape[:2]} like the image, got {depth.shape}")
-        intrinsics = np.asarray(self.intrinsics, dtype=np.float64)
-        camera_pose = np.asarray(self.camera_pose, dtype=np.float64)
+        intrinsics = np.array(self.intrinsics, dtype=np.float64)
+        camera_pose = np.array(self.camera_pose, dtype=np.float64)
         if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all():
             raise InvalidValueError(f"intrinsics must be (3, 3) and finite, got {intrinsics.shape}")
         if camera_pose.shape != (4, 4) or not np.isfinite(camera_pose).all():
@@ -49,12 +53,17 @@ class Observation:
         rotation = camera_pose[:3, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
             raise InvalidValueError("camera_pose (4, 4) must hold a proper rotation")
+        if not np.allclose(camera_pose[3], [0, 0, 0, 1], atol=1e-6):
+            raise InvalidValueError("the last row of camera_pose (4, 4) must be 0 0 0 1; is it transposed?")
+        if np.abs(camera_pose[:3, 3]).max() > FARTHEST_CAMERA_M:
+            raise InvalidValueError(f"camera_pose puts the camera at {camera_pose[:3, 3]}; is that in metres?")
         for name, value in (
             ("rgb", rgb),
             ("depth", depth),
             ("intrinsics", intrinsics),
             ("camera_pose", camera_pose),
         ):
+            value.flags.writeable = False
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -81,9 +90,11 @@ class Observation:
 
     def save(self, path: str | Path) -> None:
         """Write the observation as an ``.npz`` file that `load` reads."""
+        buffer = io.BytesIO()
         np.savez_compressed(
-            path, rgb=self.rgb, depth=self.depth, intrinsics=self.intrinsics, camera_pose=self.camera_pose
+            buffer, rgb=self.rgb, depth=self.depth, intrinsics=self.intrinsics, camera_pose=self.camera_pose
         )
+        write_whole(Path(path), buffer.getvalue())
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,7 +110,8 @@ def masked_steps(trajectory: Trajectory, length: int = TARGET_STEPS) -> np.ndarr
     total = len(trajectory)
     if total <= length:
         return np.arange(total)
-    changes = np.flatnonzero((np.abs(np.diff(trajectory.gripper_state, axis=0)) > 0.5).any(axis=1))
+    closed = trajectory.gripper_state > 0.5  # a measured state may pass through what is between
+    changes = np.flatnonzero((closed[1:] != closed[:-1]).any(axis=1))
     kept = np.unique(np.concatenate([[0, total - 1], changes, changes + 1]))
     gaps = np.diff(kept) - 1
     budget = max(length - len(kept), 0)

@@ -76,7 +76,8 @@ def read_rows(text: str, columns: int) -> FloatArray | None:
     """The rows ``(N, columns)`` of numbers in an answer, or None when one of them cannot be read for certain.
 
     Around the rows there may be prose and code fences; the last row may be cut off, and is then left out. A line
-    before or between rows that looks like a row but is none makes the answer worthless: a step would be missing.
+    before or between rows that looks like a row but is none makes the answer worthless: a step would be missing. So do
+    words between rows: an example may stand before them, and who knows which is the answer.
     """
     rows: list[FloatArray] = []
     broken = False
@@ -84,6 +85,7 @@ def read_rows(text: str, columns: int) -> FloatArray | None:
         row = read_row(line, columns)
         if row is None:
             broken = broken or _may_be_a_row(line, columns, follows_one=bool(rows))
+            broken = broken or (bool(rows) and re.search(r"[^\W\d_]{2}", line) is not None)
         elif broken:
             return None
         else:

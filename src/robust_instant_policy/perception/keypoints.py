@@ -98,6 +98,12 @@ class KeypointExtractor:
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
         self._objects = self._shared(views)
+        if len(self._objects) > self.num_keypoints:
+            notes.append(
+                f"{len(self._objects)} objects were found for {self.num_keypoints} keypoints; the largest have one each"
+            )
+            by_size = sorted(self._objects, key=lambda thing: len(thing.templates[0].painted), reverse=True)
+            self._objects = by_size[: self.num_keypoints]
         owner: list[int] = []
         places = []
         for number, thing in enumerate(self._objects):

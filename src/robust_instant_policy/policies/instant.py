@@ -106,6 +106,7 @@ class InstantPolicy:
         heard = self._heard if self._heard is not None and self._heard.observation is observation else None
         if heard is None:
             located, locating = self.context.locate(observation)
+            self.context.check(self._written)
             queries = self.prompt.queries(located.keypoints)
             heard = self._heard = _Heard(observation, located, locating, queries, [[] for _ in queries])
         self._ask(heard, num_queries)
@@ -113,6 +114,7 @@ class InstantPolicy:
         # Where the demonstrations agree on every number there is nothing to ask, and every candidate is the same.
         count = min((len(of_query) for of_query in answers), default=num_queries)
         if count < min(MIN_VALID_ANSWERS, num_queries):
+            self._heard = None  # who asks again wants the model to be asked again
             raise PlanningError(_too_few(count, num_queries, answers, self.deadline_s))
         candidates = tuple(
             self.prompt.trajectory([of_query[index].text for of_query in answers], heard.located.keypoints)
@@ -126,12 +128,13 @@ class InstantPolicy:
 
     def _ask(self, heard: _Heard, num_queries: int) -> None:
         """Sample what ``heard`` lacks of ``num_queries`` answers a query."""
-        if heard.num_asked >= num_queries or not heard.queries:
+        if heard.num_asked >= num_queries or not heard.queries or heard.seconds >= self.deadline_s:
             return
         start = time.perf_counter()
+        deadline_s = self.deadline_s - heard.seconds  # of all the sampling for one plan
         more = self.llm.sample(
             heard.queries,
-            Sampling(num_queries - heard.num_asked, self.temperature, self.seed, heard.num_asked, self.deadline_s),
+            Sampling(num_queries - heard.num_asked, self.temperature, self.seed, heard.num_asked, deadline_s),
             Listener(self.prompt.accepts, lambda done, total: self.progress("language model", done, total)),
         )
         heard.seconds += time.perf_counter() - start

@@ -73,6 +73,13 @@ class KeypointContext:
             own is given for own, given in zip(self._shown, demonstrations, strict=True)
         )
 
+    def check(self, trajectories: Sequence[Trajectory]) -> None:
+        """Raises `UsageError` unless the last `fit` made these very ``trajectories``: policies may share a context only
+        over the same demonstrations.
+        """
+        if trajectories is not self.trajectories_:
+            raise UsageError("another policy has fitted the context to other demonstrations since; call fit again")
+
     def locate(self, observation: Observation) -> tuple[Located, Stage]:
         """Where the keypoints are in ``observation``, and what finding them cost.
 

@@ -31,11 +31,13 @@ class Neighbours:
         """Find keypoints and choose frames; nothing is trained. Returns itself."""
         self.context.fit(demonstrations)
         self._frames.fit(self.context.keypoints_, self.context.trajectories_)
+        self._written = self.context.trajectories_
         return self
 
     def plan(self, observation: Observation) -> Plan:
         """Raises `KeypointError` where the scene cannot be recognised."""
         located, locating = self.context.locate(observation)
+        self.context.check(self._written)
         watch = Stopwatch()
         with watch.stage("neighbours"):
             candidates = self._frames.carried_over(located.keypoints, self.num_queries)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import UsageError
+from robust_instant_policy.errors import InvalidValueError, PlanningError, UsageError
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.llm import LanguageModel
 from robust_instant_policy.policies.instant import InstantPolicy, Proposal
 from robust_instant_policy.policies.kat import KeypointActionTokens, plan_of_first_candidate
@@ -16,6 +19,9 @@ from robust_instant_policy.trajectory import Trajectory
 
 DOF = 1.5  # ν of the paper, chosen there for the success rate
 FIRST_QUERIES = 3  # with adaptive queries: the fewest among which one hallucination can be told
+RECOGNISED = (
+    0.5  # confidence of keypoints from which on a scene counts as recognised: 0.7 to 0.9 is usual, 0.3 a stranger
+)
 ENOUGH_CONFIDENCE = 0.3  # with adaptive queries: above it, no more are asked (chosen in docs/prompts.md)
 
 
@@ -48,7 +54,8 @@ class RobustInstantPolicy(KeypointActionTokens):
         """Raises `KeypointError` or `PlanningError` where no plan can be made."""
         queries = min(FIRST_QUERIES, self.num_queries) if self.adaptive else self.num_queries
         plan = self.aggregate(self.instant.propose(observation, queries))
-        while queries < self.num_queries and (plan.confidence or 0.0) < ENOUGH_CONFIDENCE:
+        enough = ENOUGH_CONFIDENCE * recognition(plan.keypoint_confidence)  # more samples do not show the scene better
+        while queries < self.num_queries and (plan.confidence or 0.0) < enough:
             queries += 1
             plan = self.aggregate(self.instant.propose(observation, queries))
         return plan
@@ -62,19 +69,38 @@ class RobustInstantPolicy(KeypointActionTokens):
         return robust_plan(proposal, self.dof, self.estimator, self.instant.seed)
 
 
+def recognition(keypoint_confidence: FloatArray) -> float:
+    """How far a scene was recognised, from 0 to 1, by its keypoints' ``(K,)`` confidence.
+
+    The lower quarter counts: one keypoint may be hidden, but an object that is not there has several.
+    """
+    return float(min(1.0, np.quantile(keypoint_confidence, 0.25) / RECOGNISED))
+
+
 def robust_plan(proposal: Proposal, dof: float = DOF, estimator: str = "em", seed: int = 0) -> Plan:
-    """The `Plan` that follows what the candidates agree on (Oh et al. 2025, Eq. 4)."""
+    """The `Plan` that follows what the candidates agree on (Oh et al. 2025, Eq. 4).
+
+    Its confidence is the regression's, less where the scene was hardly recognised: candidates may well agree on what
+    to do with an object that is not there. Raises `PlanningError` where candidates hold no gripper.
+    """
     watch = Stopwatch()
     with watch.stage("regression"):
-        robust = robust_gripper_trajectory(
-            [candidate.actions for candidate in proposal.candidates],
-            times=[candidate.times for candidate in proposal.candidates],
-            dof=dof,
-            estimator=estimator,
-            seed=seed,
-            bends=proposal.bends,
-            variation=proposal.variation,
-        )
+        try:
+            robust = robust_gripper_trajectory(
+                [candidate.actions for candidate in proposal.candidates],
+                times=[candidate.times for candidate in proposal.candidates],
+                dof=dof,
+                estimator=estimator,
+                seed=seed,
+                bends=proposal.bends,
+                variation=proposal.variation,
+            )
+        except InvalidValueError as error:
+            raise PlanningError(f"the answers are no trajectories of a gripper: {error}") from None
+    seen = recognition(proposal.located.confidence)
+    if seen < 1:
+        note = "the scene was hardly recognised; is everything there that was there in the demonstrations?"
+        proposal = replace(proposal, notes=(*proposal.notes, note))
     return replace(
         plan_of_first_candidate(proposal),
         trajectory=Trajectory(robust.actions, robust.times),
@@ -83,6 +109,6 @@ def robust_plan(proposal: Proposal, dof: float = DOF, estimator: str = "em", see
         hallucinated=robust.hallucinated,
         onset=robust.onset,
         scores=robust.scores,
-        confidence=robust.confidence,
+        confidence=robust.confidence * seen,
         usage=Usage((*proposal.usage.stages, *watch.stages)),
     )
