@@ -44,6 +44,15 @@ def test_what_was_seen_is_not_looked_at_again(context, demonstrations, workbench
     assert context.locate(observation)[0] is located
 
 
+def test_a_context_that_was_fitted_to_other_demonstrations_since_is_refused(demonstrations, workbench):
+    shared, seen = KeypointContext(), Observation.load(workbench / "observation.npz")
+    policy = Neighbours(shared).fit(demonstrations)
+    Neighbours(shared).fit(demonstrations[:2])
+    with pytest.raises(UsageError, match="fit again"):
+        policy.plan(seen)
+    policy.fit(demonstrations).plan(seen)
+
+
 def test_planning_before_fitting_is_refused(workbench):
     with pytest.raises(UsageError, match="fit"):
         Neighbours(KeypointContext()).plan(Observation.load(workbench / "observation.npz"))

@@ -321,7 +321,9 @@ def _train(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    if any(options.folder.glob("episodes.*")):  # the table, or the journal of one that has just begun
+    from robust_instant_policy.evaluation.episodes import holds_episodes
+
+    if holds_episodes(options.folder):
         from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
 
         publish(options.folder)

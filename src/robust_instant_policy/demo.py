@@ -13,6 +13,7 @@ from robust_instant_policy.datasets import VideoWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import UnreachableError, UsageError
 from robust_instant_policy.evaluation import obtain_demonstrations, scene_seed
+from robust_instant_policy.evaluation.episodes import holds_episodes
 from robust_instant_policy.llm import connect
 from robust_instant_policy.policies import InstantPolicy, RobustInstantPolicy
 from robust_instant_policy.report import (
@@ -34,7 +35,7 @@ def run_demo(
 
     ``demonstrations`` is a number, recorded into ``data/TASK`` where they are missing, or a folder.
     """
-    if any(out.glob("episodes.*")):
+    if holds_episodes(out):
         raise UsageError(f"{out} holds an evaluation; give the demo another folder with --out")
     screen = StageConsole()
     scene = scene_seed(seed, 0)

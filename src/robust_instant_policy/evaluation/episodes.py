@@ -40,6 +40,11 @@ class Episode:
         return self.scene, self.variant, self.candidate
 
 
+def holds_episodes(folder: Path) -> bool:
+    """Whether ``folder`` is that of an evaluation: it has the table, or the journal of one that has just begun."""
+    return any(folder.glob(Path(EPISODES_FILE).with_suffix(".*").name))
+
+
 def open_episodes(folder: Path) -> RowFile[Episode]:
     """The rows of ``folder/episodes.parquet``."""
     return RowFile(Episode, folder / EPISODES_FILE)

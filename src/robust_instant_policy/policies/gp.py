@@ -90,8 +90,8 @@ class KeypointRegression:
     def fit(self, demonstrations: Sequence[Demonstration]) -> Self:
         """Find keypoints and the kernel's parameters, in a fraction of a second; returns itself."""
         self.context.fit(demonstrations)
-        aligned = align(self.context.trajectories_)
         self._written = self.context.trajectories_
+        aligned = align(self._written)
         keypoints = self.context.keypoints_[list(aligned.kept)]
         self._shape = aligned.actions.shape[1:]
         self.process_ = GaussianProcess.fitted(
@@ -103,8 +103,7 @@ class KeypointRegression:
         """Raises `KeypointError` where the scene cannot be recognised."""
         if not hasattr(self, "process_"):
             raise UsageError("call fit(demonstrations) before asking for a plan")
-        located, locating = self.context.locate(observation)
-        self.context.check(self._written)
+        located, locating = self.context.locate(observation, self._written)
         watch = Stopwatch()
         with watch.stage("gaussian process"):
             mean, deviation = self.process_.predict(located.keypoints.reshape(1, -1))

@@ -105,8 +105,7 @@ class InstantPolicy:
             raise UsageError(f"the number of queries must be at least 1, got {num_queries}")
         heard = self._heard if self._heard is not None and self._heard.observation is observation else None
         if heard is None:
-            located, locating = self.context.locate(observation)
-            self.context.check(self._written)
+            located, locating = self.context.locate(observation, self._written)
             queries = self.prompt.queries(located.keypoints)
             heard = self._heard = _Heard(observation, located, locating, queries, [[] for _ in queries])
         self._ask(heard, num_queries)

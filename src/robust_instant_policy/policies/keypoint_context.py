@@ -73,21 +73,17 @@ class KeypointContext:
             own is given for own, given in zip(self._shown, demonstrations, strict=True)
         )
 
-    def check(self, trajectories: Sequence[Trajectory]) -> None:
-        """Raises `UsageError` unless the last `fit` made these very ``trajectories``: policies may share a context only
-        over the same demonstrations.
-        """
-        if trajectories is not self.trajectories_:
-            raise UsageError("another policy has fitted the context to other demonstrations since; call fit again")
-
-    def locate(self, observation: Observation) -> tuple[Located, Stage]:
+    def locate(self, observation: Observation, fitted: Sequence[Trajectory] | None = None) -> tuple[Located, Stage]:
         """Where the keypoints are in ``observation``, and what finding them cost.
 
         Asking again about the same observation object reuses the answer. Raises `KeypointError` where the scene
-        cannot be recognised.
+        cannot be recognised, and `UsageError` where ``fitted``, the `trajectories_` that a policy was fitted to, are
+        not those of the last `fit`: policies may share a context only over the same demonstrations.
         """
         if not self._shown:
             raise UsageError("call fit(demonstrations) before asking for a plan")
+        if fitted is not None and fitted is not self.trajectories_:
+            raise UsageError("another policy has fitted the context to other demonstrations since; call fit again")
         if self._seen is None or self._seen[0] is not observation:
             watch = Stopwatch()
             self.progress("keypoints", 0, 0)

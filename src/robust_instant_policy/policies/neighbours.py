@@ -26,6 +26,7 @@ class Neighbours:
     def __init__(self, context: KeypointContext, num_queries: int = 5):
         self.context, self.num_queries = context, num_queries
         self._frames = InContextPrompt(frames="adaptive", layout="factorised")
+        self._written: Sequence[Trajectory] = ()
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> Self:
         """Find keypoints and choose frames; nothing is trained. Returns itself."""
@@ -36,8 +37,7 @@ class Neighbours:
 
     def plan(self, observation: Observation) -> Plan:
         """Raises `KeypointError` where the scene cannot be recognised."""
-        located, locating = self.context.locate(observation)
-        self.context.check(self._written)
+        located, locating = self.context.locate(observation, self._written)
         watch = Stopwatch()
         with watch.stage("neighbours"):
             candidates = self._frames.carried_over(located.keypoints, self.num_queries)

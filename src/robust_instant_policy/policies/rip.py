@@ -19,9 +19,7 @@ from robust_instant_policy.trajectory import Trajectory
 
 DOF = 1.5  # ν of the paper, chosen there for the success rate
 FIRST_QUERIES = 3  # with adaptive queries: the fewest among which one hallucination can be told
-RECOGNISED = (
-    0.5  # confidence of keypoints from which on a scene counts as recognised: 0.7 to 0.9 is usual, 0.3 a stranger
-)
+RECOGNISED = 0.5  # confidence of keypoints from which on a scene counts as recognised; 0.7 to 0.8 is usual
 ENOUGH_CONFIDENCE = 0.3  # with adaptive queries: above it, no more are asked (chosen in docs/prompts.md)
 
 

@@ -51,7 +51,8 @@ class KeypointDiffusion:
     def fit(self, demonstrations: Sequence[Demonstration]) -> Self:
         """Load the weights that belong to ``demonstrations``, or train them; returns itself."""
         self.context.fit(demonstrations)
-        aligned = align(self.context.trajectories_)
+        self._written = self.context.trajectories_
+        aligned = align(self._written)
         keypoints = self.context.keypoints_[list(aligned.kept)].reshape(len(aligned.kept), -1)
         actions = aligned.actions
         self._keypoints, self._actions = keypoints, actions
@@ -85,7 +86,7 @@ class KeypointDiffusion:
         """Raises `KeypointError` where the scene cannot be recognised."""
         if not hasattr(self, "trained_"):
             raise UsageError("call fit(demonstrations) before asking for a plan")
-        located, locating = self.context.locate(observation)
+        located, locating = self.context.locate(observation, self._written)
         watch = Stopwatch()
         with watch.stage("diffusion"):
             candidates = self._sampled(located.keypoints, self.trained_.model)
