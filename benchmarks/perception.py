@@ -38,7 +38,7 @@ from robust_instant_policy.perception.accuracy import Accuracy
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.efficientnet import load_network
 from robust_instant_policy.perception.settings import DescriptorSettings
-from robust_instant_policy.perception.vit import VitDescriptors
+from robust_instant_policy.perception.vit import VisionTransformer, VitDescriptors
 from robust_instant_policy.perception.vit_checkpoint import load_checkpoint
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
@@ -164,13 +164,10 @@ def measure_speed(features: str, settings: DescriptorSettings, shape: tuple[int,
     if features == "dino":
         described = VitDescriptors(load_checkpoint(weights), settings)
         batch = described.prepare(images[0].rgb)
-        tokens = described._network
+        network = VisionTransformer(load_checkpoint(weights).model, settings.stride)
 
-        def bare() -> None:  # every block, whole
-            with torch.inference_mode():
-                state, _ = tokens._embed(batch)
-                for index in range(tokens.config.num_hidden_layers):
-                    state = tokens._block(index, state)
+        def bare() -> None:
+            network.features(batch, settings.layer, settings.facet)
     else:
         network = load_network()
         rows, cols = (round(edge * settings.load_size / min(shape) * 4 / settings.stride / 16) * 16 for edge in shape)
