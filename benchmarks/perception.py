@@ -29,7 +29,6 @@ import numpy as np
 import torch
 from dino_reference import ReferenceTransformer, load_reference, random_checkpoint
 from PIL import Image, ImageDraw
-from safetensors.torch import save_file
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray
@@ -219,8 +218,8 @@ def speed(features: list[str], columns: list[str], checkout: Path | None) -> Non
     one_thread = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
-        weights = str(Path(folder) / "model.safetensors")
-        save_file(dict(random_checkpoint(0).tensors), weights)
+        weights = folder
+        random_checkpoint(0).model.save_pretrained(weights)
         for column in columns:
             for name in features:
                 command = [sys.executable, __file__, "one", name, column, weights]
