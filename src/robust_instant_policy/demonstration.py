@@ -137,6 +137,8 @@ UNREADABLE_NPZ = (
 def _read_array(archive: zipfile.ZipFile, name: str) -> NDArray:
     """One array of an ``.npz``; raises `InvalidValueError` for one of an odd type or size, before it is read."""
     entry = archive.getinfo(f"{name}.npy")
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # the two that NumPy writes
+        raise InvalidValueError(f"{name} is compressed in a way that NumPy does not write")
     with archive.open(entry) as stream:
         version = npy.read_magic(stream)
         read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 from robust_instant_policy.errors import DatasetError
 
 MAX_JSON_BYTES = 64 * 2**20
+MAX_EXCERPT = 120  # characters of a file that an error quotes
 KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a named pipe",
@@ -68,6 +69,12 @@ def _checked_name(path: str | Path) -> str | Path:
 def _require_regular(path: str | Path, mode: int) -> None:
     if not stat.S_ISREG(mode):
         raise DatasetError(f"{path} is {KINDS.get(stat.S_IFMT(mode), 'something else')}, not a regular file")
+
+
+def excerpt(said: str | Path | Exception) -> str:
+    """What a file or an error says, on one line of at most `MAX_EXCERPT` characters."""
+    text = " ".join(str(said).split())
+    return text if len(text) <= MAX_EXCERPT else text[:MAX_EXCERPT] + "…"
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -7,6 +7,7 @@ A folder may come from anywhere, so what it says is checked once, when it is rea
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,7 +24,7 @@ from robust_instant_policy.datasets import layout
 from robust_instant_policy.datasets.video import decode_video
 from robust_instant_policy.demonstration import MAX_PIXELS
 from robust_instant_policy.errors import DatasetError, NoDemonstrationsError
-from robust_instant_policy.files import finished_files, open_regular, read_json
+from robust_instant_policy.files import excerpt, finished_files, open_regular, read_json
 from robust_instant_policy.geometry import FloatArray
 
 CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
@@ -76,7 +77,9 @@ class Folder:
         try:
             return _matrix(column)
         except (ValueError, pa.ArrowException) as error:
-            raise DatasetError(f"{self.root} is damaged: episode {episode}: {name} {error}; {REPAIR}") from None
+            raise DatasetError(
+                f"{self.root} is damaged: episode {episode}: {name} {excerpt(error)}; {REPAIR}"
+            ) from None
 
     def frames(self, episode: int, key: str) -> Iterator[NDArray]:
         """Images ``(H, W, 3)`` uint8 of an episode's video feature ``key``, in order."""
@@ -86,7 +89,10 @@ class Folder:
         _check_whole_numbers(self.root, episode, row, wanted)
         start, stop = (row.get(f"{video}/{name}") for name in ("from_timestamp", "to_timestamp"))
         if not (isinstance(start, float | int) and isinstance(stop, float | int) and 0 <= start < stop < math.inf):
-            raise DatasetError(f"{self.root} is damaged: episode {episode} lasts from {start} to {stop} s in {video}")
+            raise DatasetError(
+                f"{self.root} is damaged: episode {episode} of {excerpt(video)} lasts from {reprlib.repr(start)} "
+                f"to {reprlib.repr(stop)} s; {REPAIR}"
+            )
         path = self._path(
             "video_path",
             video_key=key,
@@ -131,11 +137,11 @@ def open_folder(path: Path, task: str | None = None) -> Folder:
     missing = [entry for entry in INFO_ENTRIES if entry not in info]
     if missing:
         raise DatasetError(f"{file} lacks {', '.join(missing)}; restore it, or record again")
-    version = str(info["codebase_version"])[:20]
-    if not version.startswith("v3."):
+    version = info["codebase_version"]
+    if not (isinstance(version, str) and version.startswith("v3.")):
         convert = f"; convert it with: {CONVERTER} --repo-id=NAME --root={path} --push-to-hub=false"
         raise DatasetError(
-            f"{path} is a LeRobotDataset {version!r}, and {layout.CODEBASE_VERSION} is needed"
+            f"{path} is a LeRobotDataset {reprlib.repr(version)}, and {layout.CODEBASE_VERSION} is needed"
             + (convert if version == "v2.1" else "")
         )
     try:
@@ -163,7 +169,9 @@ def read_seed(row: Mapping[str, Any]) -> int | None:
     """The seed that our own folders keep in a row of ``meta/episodes``. Raises `DatasetError` for anything else."""
     seed = row.get(layout.SEED_COLUMN)
     if seed is not None and not isinstance(seed, int):
-        raise DatasetError(f"{layout.SEED_COLUMN} of an episode must be a whole number, got {_excerpt(seed)}; {REPAIR}")
+        raise DatasetError(
+            f"{layout.SEED_COLUMN} of an episode must be a whole number, got {reprlib.repr(seed)}; {REPAIR}"
+        )
     return seed
 
 
@@ -173,10 +181,10 @@ def inside(root: Path, relative: str | Path) -> Path:
     try:
         within = path.resolve().is_relative_to(root.resolve())
     except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a name too long, a null character
-        raise DatasetError(f"{root} names a file that cannot be: {str(relative)[:100]!r} ({error})") from None
+        raise DatasetError(f"{root} names a file that cannot be: {excerpt(relative)!r} ({excerpt(error)})") from None
     if not within:
         raise DatasetError(
-            f"{root} names a file outside of itself: {str(relative)[:100]!r}; "
+            f"{root} names a file outside of itself: {excerpt(relative)!r}; "
             "where these are symbolic links of your own, copy the folder with: cp -rL"
         )
     return path
@@ -253,38 +261,31 @@ def _check_info(info: Mapping[str, Any]) -> None:
     """Raises `ValueError` unless the entries of ``meta/info.json`` that are used have their types and ranges."""
     fps = info["fps"]
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps < MAX_INDEX:
-        raise ValueError(f"fps must be a positive number, got {_excerpt(fps)}")
+        raise ValueError(f"fps must be a positive number, got {reprlib.repr(fps)}")
     for name in ("total_episodes", "total_frames"):
         if not _is_whole(info[name]):
-            raise ValueError(f"{name} must be a whole number, got {_excerpt(info[name])}")
+            raise ValueError(f"{name} must be a whole number, got {reprlib.repr(info[name])}")
     for name, fields in (("data_path", layout.INDICES), ("video_path", (*layout.INDICES, "video_key"))):
         template = info.get(name)
         if template is None and name == "video_path":
             continue
         if not isinstance(template, str):
-            raise ValueError(f"{name} must be a path template, got {_excerpt(template)}")
+            raise ValueError(f"{name} must be a path template, got {reprlib.repr(template)}")
         layout.check_template(template, fields)
     if not isinstance(info["features"], dict):
-        raise ValueError(f"features must be an object, got {_excerpt(info['features'])}")
+        raise ValueError(f"features must be an object, got {reprlib.repr(info['features'])}")
     for key, feature in info["features"].items():
         if not (isinstance(feature, dict) and isinstance(feature.get("dtype"), str)):
-            raise ValueError(f"the feature {key[:50]!r} must have a dtype, got {_excerpt(feature)}")
+            raise ValueError(f"the feature {excerpt(key)!r} must have a dtype, got {reprlib.repr(feature)}")
         shape = feature.get("shape")
         if not (
             isinstance(shape, list) and all(_is_whole(side) for side in shape) and math.prod(shape) < 4 * MAX_PIXELS
         ):
-            raise ValueError(f"the feature {key[:50]!r} must have a shape, got {_excerpt(shape)}")
+            raise ValueError(f"the feature {excerpt(key)!r} must have a shape, got {reprlib.repr(shape)}")
 
 
 def _is_whole(value: object, least: int = 0) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and least <= value < MAX_INDEX
-
-
-def _excerpt(value: object) -> str:
-    """A value of any size in a few words."""
-    if isinstance(value, dict | list):
-        return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
-    return repr(value) if len(repr(value)) <= 40 else repr(value)[:40] + "…"
 
 
 def _read_episodes(root: Path, count: int) -> list[dict[str, Any]]:
@@ -295,7 +296,7 @@ def _read_episodes(root: Path, count: int) -> list[dict[str, Any]]:
         try:
             rows += table.to_pylist()
         except (ValueError, OverflowError, pa.ArrowException) as error:
-            raise DatasetError(f"{path} is damaged ({error}); {REPAIR}") from None
+            raise DatasetError(f"{path} is damaged ({excerpt(error)}); {REPAIR}") from None
         if len(rows) >= count:
             break
     if len(rows) < count or [row.get("episode_index") for row in rows[:count]] != list(range(count)):
@@ -313,6 +314,6 @@ def _check_whole_numbers(root: Path, episode: int, row: Mapping[str, Any], least
     for name, low in least.items():
         if not _is_whole(row.get(name), low):
             raise DatasetError(
-                f"{root} is damaged: {name} of episode {episode} is {_excerpt(row.get(name))}, not a whole number; "
+                f"{root} is damaged: {name} of episode {episode} is {reprlib.repr(row.get(name))}, not a whole number; "
                 "restore it, or record again"
             )

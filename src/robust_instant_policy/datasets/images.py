@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,10 @@ FINE_UNIT_M = 1e-4  # one step of 16-bit depth; reaches 6.5 m
 COARSE_UNIT_M = 1e-3  # for cameras that read further; reaches 65.5 m
 REPAIR = "restore it, or record the folder again"
 MAX_STEPS = np.iinfo(np.uint16).max
+
+
+# What Pillow raises for content that is damaged, or declares more pixels than anyone takes.
+DAMAGE = (OSError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError, Image.DecompressionBombWarning)
 
 
 def encode_png(image: NDArray) -> bytes:
@@ -73,10 +78,12 @@ def _open(path: Path) -> Image.Image:
 def decode_image(content: bytes, formats: tuple[str, ...]) -> Image.Image:
     """The image in a file's ``content``; raises `ValueError` for another format, and for one that is damaged."""
     try:
-        with Image.open(io.BytesIO(content), formats=formats) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise ValueError(f"it declares {image.width} x {image.height} pixels")
-            image.load()
-            return image
-    except (OSError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            image = Image.open(io.BytesIO(content), formats=formats)
+        if image.width * image.height > MAX_PIXELS:
+            raise ValueError(f"it declares {image.width} x {image.height} pixels")
+        image.load()
+        return image
+    except DAMAGE as error:
         raise ValueError(f"it is no image of the kind {' or '.join(formats)}") from error

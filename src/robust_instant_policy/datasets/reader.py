@@ -15,6 +15,7 @@ from robust_instant_policy.datasets.folder import Folder, inside, open_folder, r
 from robust_instant_policy.datasets.images import read_depth, read_rgb
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.files import excerpt
 from robust_instant_policy.geometry import FloatArray, as_numbers
 from robust_instant_policy.trajectory import Trajectory
 
@@ -38,7 +39,8 @@ def load_demonstrations(path: str | Path, task: str | None = None, limit: int | 
     name = read_recording(root)["task"]
     if task is not None and name != task:
         raise DatasetError(
-            f"{root} holds demonstrations of {name!r}, not of {task!r}; choose another folder, or --task {name}"
+            f"{root} holds demonstrations of {excerpt(name)!r}, not of {task!r}; "
+            f"choose another folder, or --task {excerpt(name)}"
         )
     count = len(folder.episodes) if limit is None else min(limit, len(folder.episodes))
     return [_read_demonstration(folder, episode, name) for episode in range(count)]
@@ -82,11 +84,11 @@ def _read_demonstration(folder: Folder, episode: int, task: str) -> Demonstratio
         )
     except KeyError as error:
         raise DatasetError(
-            f"{folder.root} is damaged: meta/episodes lacks {error}; restore it, or record again"
+            f"{folder.root} is damaged: meta/episodes lacks {excerpt(error)}; restore it, or record again"
         ) from None
     except (InvalidValueError, ValueError) as error:
         raise DatasetError(
-            f"{folder.root} is damaged: episode {episode}: {error}; restore it, or record again"
+            f"{folder.root} is damaged: episode {episode}: {excerpt(error)}; restore it, or record again"
         ) from error
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -31,6 +32,7 @@ from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import (
     PART_SUFFIX,
+    excerpt,
     finished_files,
     lock_folder,
     make_folder,
@@ -129,9 +131,13 @@ class DatasetWriter:
         if (self.path / layout.RIP_PATH).exists():
             own = read_recording(self.path)
             if own["task"] != self.task:
-                raise DatasetError(f"{self.path} holds demonstrations of {own['task']!r}, not of {self.task!r}")
+                raise DatasetError(
+                    f"{self.path} holds demonstrations of {excerpt(own['task'])!r}, not of {self.task!r}"
+                )
             if own.get("rate_hz") != self.rate_hz:
-                raise DatasetError(f"{self.path} was recorded at {own.get('rate_hz')} Hz, not at {self.rate_hz} Hz")
+                raise DatasetError(
+                    f"{self.path} was recorded at {reprlib.repr(own.get('rate_hz'))} Hz, not at {self.rate_hz} Hz"
+                )
             self.description = own.get("description", self.description)
             self._discarded_seeds = own.get("discarded_seeds", [])
             self._take_up()
@@ -152,8 +158,8 @@ class DatasetWriter:
                     self._statistics = _combined(self._statistics, read_statistics(self.path, episode))
                 except (KeyError, ValueError, TypeError, IndexError) as error:
                     raise DatasetError(
-                        f"{self.path} is damaged: the statistics of episode {episode} are not as written ({error}); "
-                        "restore it, or choose another folder"
+                        f"{self.path} is damaged: the statistics of episode {episode} are not as written "
+                        f"({excerpt(error)}); restore it, or choose another folder"
                     ) from None
         self._remove_unfinished(self.num_episodes)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import reprlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
-from robust_instant_policy.files import read_json, write_whole
+from robust_instant_policy.files import excerpt, read_json, write_whole
 from robust_instant_policy.geometry import FloatArray, as_numbers
 from robust_instant_policy.trajectory import Trajectory
 
@@ -122,7 +123,7 @@ class Plan:
                 raise DatasetError(f"no plan at {path}")
             content = read_json(path)
             if content["format"] != PLAN_FORMAT:
-                found = str(content["format"])[:20]
+                found = reprlib.repr(content["format"])
                 raise DatasetError(f"{path} has plan format {found}, this version reads {PLAN_FORMAT}")
             trajectory = _from_json(content["trajectory"])
             candidates = tuple(_from_json(candidate) for candidate in content["candidates"])
@@ -139,7 +140,7 @@ class Plan:
         except OSError as error:
             raise DatasetError(f"{path} cannot be read: {error.strerror}") from None
         except (KeyError, TypeError, ValueError, InvalidValueError) as error:
-            raise DatasetError(f"{path} is not a plan: {error}") from None
+            raise DatasetError(f"{path} is not a plan: {excerpt(error)}") from None
 
 
 _ARRAYS: dict[str, tuple[type, str]] = {  # type, and size of each axis: a letter or a number
@@ -184,7 +185,7 @@ def _checked_notes(notes: object) -> tuple[str, ...]:
 
 def _checked_confidence(value: float | None) -> float | None:
     if value is not None and not (isinstance(value, int | float) and 0.0 <= value <= 1.0):
-        raise ValueError(f"its confidence is {str(value)[:20]}, not a number from 0 to 1")
+        raise ValueError(f"its confidence is {reprlib.repr(value)}, not a number from 0 to 1")
     return value
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.errors import DatasetError, MissingExtraError
-from robust_instant_policy.files import open_regular
+from robust_instant_policy.files import excerpt, open_regular
 
 MAX_ARRAY_BYTES = 2**32  # of one array; the images of an episode are the largest
 
@@ -29,20 +29,16 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     try:
         open_regular(path).close()
         with h5py.File(path, "r") as file:
-            file.visititems_links(_refuse_link)
+            link = file.visititems_links(lambda name, link: None if isinstance(link, h5py.HardLink) else name)
+            if link is not None:
+                raise DatasetError(
+                    f"{path}: {excerpt(link)!r} is a link in place of content; copy the file with its links resolved"
+                )
             yield file
     except FileNotFoundError:
         raise DatasetError(f"there is no file {path}") from None
     except (OSError, RuntimeError, KeyError) as error:  # of h5py, for damage in any place of the file
-        reason = " ".join(str(error).split())
-        raise DatasetError(f"{path} is damaged or not an HDF5 file: {reason}") from error
-
-
-def _refuse_link(name: str, link: Any) -> None:
-    import h5py
-
-    if not isinstance(link, h5py.HardLink):
-        raise DatasetError(f"{name} is a link in place of content; copy the file with its links resolved: h5repack")
+        raise DatasetError(f"{path} is damaged or not an HDF5 file: {excerpt(error)}") from error
 
 
 def has(group: Any, name: str) -> bool:
@@ -67,7 +63,7 @@ def read(group: Any, name: str, ndim: int) -> NDArray | None:
     if not isinstance(data, h5py.Dataset) or data.dtype.kind not in "biuf":
         raise DatasetError(f"{where} is not an array of numbers")
     if data.is_virtual or data.external:
-        raise DatasetError(f"{where} is stored in another file; copy it into this one: h5repack")
+        raise DatasetError(f"{where} is stored in another file; copy its content into this one")
     if data.ndim != ndim or not data.size:
         raise DatasetError(f"{where} must have {ndim} dimensions and not be empty, got {data.shape}")
     if data.nbytes > MAX_ARRAY_BYTES:

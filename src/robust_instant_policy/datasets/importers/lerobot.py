@@ -23,6 +23,7 @@ from robust_instant_policy.datasets.images import decode_image
 from robust_instant_policy.datasets.importers.hdf5 import choose_camera
 from robust_instant_policy.datasets.importers.source import SourceEpisode, poses_of
 from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.files import excerpt
 from robust_instant_policy.geometry import FloatArray, as_numbers
 
 AXIS = re.compile(r"(?:.*[._ ])?(x|y|z|wx|wy|wz|qx|qy|qz|qw)$")
@@ -134,4 +135,6 @@ def _first_image(folder: Folder, episode: int, key: str) -> NDArray:
             raise ValueError("its images are not stored in the table")
         return np.asarray(decode_image(value["bytes"], ("PNG", "JPEG", "TIFF")))
     except (ValueError, OverflowError, pa.ArrowException) as error:
-        raise DatasetError(f"{folder.root}: episode {episode} has no readable image {key!r} ({error})") from error
+        raise DatasetError(
+            f"{folder.root}: episode {episode} has no readable image {excerpt(key)!r} ({excerpt(error)})"
+        ) from error
