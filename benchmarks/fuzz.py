@@ -96,8 +96,8 @@ def fuzz(target: Target, cases: int, seed: int, progress: Progress) -> Tally:
 
 def table(tallies: dict[str, Tally], seed: int) -> str:
     lines = [
-        f"Written by `python benchmarks/fuzz.py --seed {seed}`. A case is refused with an error in one line, or accepted "
-        "with a value that keeps its promises; the slowest is in seconds of processor time.",
+        f"Written by `python benchmarks/fuzz.py --seed {seed}`. A case is refused with an error in one line, or "
+        "accepted with a value that keeps its promises; the slowest is in seconds of processor time.",
         "",
         "| target | cases | refused | accepted | slowest, s | failed |",
         "| --- | --- | --- | --- | --- | --- |",
