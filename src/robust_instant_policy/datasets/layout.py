@@ -51,7 +51,11 @@ def check_template(template: str, fields: Collection[str]) -> None:
 
     What remains is safe to format: no attributes or items of the values, no widths of any size.
     """
-    for _, field, spec, conversion in string.Formatter().parse(template):
+    try:
+        parts = list(string.Formatter().parse(template))
+    except ValueError as error:
+        raise ValueError(f"the path template {template[:100]!r} is none: {error}") from None
+    for _, field, spec, conversion in parts:
         if field is None:
             continue
         plain = PLAIN_NUMBER.fullmatch(spec or "") if field in INDICES else not spec
