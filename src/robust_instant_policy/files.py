@@ -43,8 +43,8 @@ def open_regular(path: str | Path) -> BinaryIO:
     return file
 
 
-def read_json(path: str | Path) -> dict[str, Any]:
-    """The JSON object in a regular file. Raises `DatasetError` naming the file."""
+def read_json(path: str | Path, kind: str = "a JSON object") -> dict[str, Any]:
+    """The JSON object in a regular file. Raises `DatasetError` naming the file and the ``kind`` that it should be of."""
     try:
         with open_regular(path) as file:
             text = file.read(MAX_JSON_BYTES + 1)
@@ -54,9 +54,9 @@ def read_json(path: str | Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise DatasetError(f"{path} is missing; restore it, or write it again") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{path} cannot be read as JSON: restore it, or write it again") from error
+        raise DatasetError(f"{path} is not {kind}: it cannot be read as JSON; restore it, or write it again") from error
     if not isinstance(content, dict):
-        raise DatasetError(f"{path} must hold a JSON object: restore it, or write it again")
+        raise DatasetError(f"{path} is not {kind}: it must hold a JSON object; restore it, or write it again")
     return content
 
 

@@ -121,7 +121,7 @@ class Plan:
         try:
             if not Path(path).exists():
                 raise DatasetError(f"no plan at {path}")
-            content = read_json(path)
+            content = read_json(path, "a plan")
             if content["format"] != PLAN_FORMAT:
                 found = reprlib.repr(content["format"])
                 raise DatasetError(f"{path} has plan format {found}, this version reads {PLAN_FORMAT}")
