@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import importlib.util
 import sys
 import traceback
 from dataclasses import dataclass
@@ -22,6 +23,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tests.fuzz_targets import CORPUS, TARGETS, Case, Target, run  # noqa: E402
+
+if importlib.util.find_spec("tests.fuzz_targets_llm"):
+    from tests.fuzz_targets_llm import SERVER_REPLIES, check_server_reply
+
+    TARGETS["replies"] = Target("replies", SERVER_REPLIES.map(Case), lambda case: check_server_reply(case) is None)
 
 TABLE = ROOT / "docs" / "tables" / "fuzz.md"
 MAX_KEPT_BYTES = 64 * 1024  # of a failed case

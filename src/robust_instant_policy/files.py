@@ -44,7 +44,7 @@ def open_regular(path: str | Path) -> BinaryIO:
 
 
 def read_json(path: str | Path, kind: str = "a JSON object") -> dict[str, Any]:
-    """The JSON object in a regular file. Raises `DatasetError` naming the file and the ``kind`` that it should be of."""
+    """The JSON object in a regular file. Raises `DatasetError` that names the file and the ``kind`` it should be."""
     try:
         with open_regular(path) as file:
             text = file.read(MAX_JSON_BYTES + 1)
