@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 from robust_instant_policy.errors import DatasetError
 
 MAX_JSON_BYTES = 64 * 2**20
-MAX_EXCERPT = 120  # characters of a file that an error quotes
+MAX_EXCERPT = 240  # characters of a file that an error quotes
 KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a named pipe",
