@@ -193,7 +193,7 @@ def mutated_json(draw: st.DrawFn, original: dict) -> bytes:
                     del holder[path[-1]]
                 case "rename":
                     holder[str(draw(st.sampled_from(ODD_TEXTS)))] = holder.pop(path[-1])
-        except (KeyError, IndexError, TypeError):  # gone by an earlier mutation
+        except (KeyError, IndexError, TypeError, AttributeError):  # gone by an earlier mutation
             continue
     text = json.dumps(content).encode()
     return draw(mutated_bytes(text)) if draw(st.integers(0, 5)) == 0 else text
