@@ -125,7 +125,7 @@ def evaluate(
             screen.say(f"  {what.scene} {what.variant} #{what.candidate}: {verdict}")
         screen.done_so_far("plans executed", done, total)
 
-    progress = Progress(recording, outcome, TrainingScreen(screen), partial(keep_training_picture, out))
+    progress = Progress(recording, outcome, TrainingScreen(screen), trained=partial(keep_training_picture, out))
     with invocation(out, suites, arguments, model_name(setup.llm)), screen.stage("evaluation"):
         run_suites(suites, setup, out, _hands(workers, ray), progress)
     screen.say("")
