@@ -252,6 +252,8 @@ def test_other_bad_arguments_are_refused():
     fit = StudentTRegression().fit([np.zeros((4, 2))])
     with pytest.raises(InvalidValueError, match=r"times must be \(T,\)"):
         fit.mean(np.zeros((2, 2)))
+    with pytest.raises(InvalidValueError, match="3 dimensions"):
+        diagnose(fit, [np.zeros((4, 3))])
     for level in (1.5, 0, np.nan, "0.9", True):
         with pytest.raises(InvalidValueError, match="level"):
             fit.interval(level)
