@@ -240,7 +240,7 @@ def test_each_answer_is_read_once_and_carries_what_it_says(tmp_path):
     asked = QUERIES, Sampling(4, temperature=0.5), Listener(number)
     recorded = RecordedModel(model, store).sample(*asked)
     assert [[answer.value for answer in own] for own in recorded] == [[0, 1, 2, 3]] * 3
-    assert len(read) == model.asked
+    assert len(read) <= model.asked
     assert [[answer.value for answer in own] for own in ReplayedModel(store, "counting").sample(*asked)] == [
         [0, 1, 2, 3]
     ] * 3

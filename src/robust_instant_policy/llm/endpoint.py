@@ -67,7 +67,7 @@ class Endpoint:
 
     def count_tokens(self, text: str) -> int:
         async def count() -> int:
-            async with self.connection() as connection:
+            async with contextlib.aclosing(self.connection()) as connection:
                 return await self.count(connection, await self.learn(connection), text)
 
         return _run(count())
@@ -86,7 +86,7 @@ class Endpoint:
         return Connection(self.url, has_answered=bool(self._told))
 
     async def _facts(self) -> Server:
-        async with self.connection() as connection:
+        async with contextlib.aclosing(self.connection()) as connection:
             return await self.learn(connection)
 
     async def learn(self, connection: Connection, time_s: float = FACTS_TIME_S) -> Server:
@@ -223,7 +223,10 @@ class _Plan:
     async def carry_out(self) -> None:
         failure: ModelError | None = None
         try:
-            async with asyncio.timeout(self._sampling.deadline_s), self._endpoint.connection() as connection:
+            async with (
+                asyncio.timeout(self._sampling.deadline_s),
+                contextlib.aclosing(self._endpoint.connection()) as connection,
+            ):
                 server = await self._endpoint.learn(connection, HEAD_START * self._sampling.deadline_s)
                 await self._endpoint.refuse_long(connection, server, self._queries)
                 try:
