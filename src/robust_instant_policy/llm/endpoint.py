@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from robust_instant_policy.errors import ModelError
+from robust_instant_policy.errors import ModelError, RipError
 from robust_instant_policy.llm.dialect import Dialect, Server, Style, discover
 from robust_instant_policy.llm.model import (
     NOBODY,
@@ -126,10 +126,8 @@ class Endpoint:
         if server.counts_tokens:
             body = server.tokenize_body(self.name, text)
             with contextlib.suppress(UnavailableError, RefusedError):
-                tokens = as_map(await connection.request(self.url.removesuffix("/v1") + "/tokenize", body)).get(
-                    "tokens"
-                )
-                if isinstance(tokens, list):
+                reply = await connection.request(self.url.removesuffix("/v1") + "/tokenize", body)
+                if isinstance(tokens := as_map(reply).get("tokens"), list):
                     return len(tokens)
         return estimate_tokens(text)
 
@@ -221,7 +219,7 @@ class _Plan:
         self._last_failure = "nothing came back"
 
     async def carry_out(self) -> None:
-        failure: ModelError | None = None
+        failure: RipError | None = None
         try:
             async with (
                 asyncio.timeout(self._sampling.deadline_s),
@@ -238,7 +236,7 @@ class _Plan:
                         self._opened.set()
                         for index in range(1, len(self._queries)):
                             group.create_task(self._fill(connection, index))
-                except* ModelError as errors:
+                except* RipError as errors:
                     failure = _first(errors)
         except TimeoutError:
             pass
@@ -303,7 +301,7 @@ class _Plan:
                 pause = min(2 * pause, LONGEST_PAUSE_S)
 
 
-def _first(errors: BaseExceptionGroup[ModelError]) -> ModelError:
+def _first(errors: BaseExceptionGroup[RipError]) -> RipError:
     """The first of the errors in a group, however deep groups are nested."""
     first = errors.exceptions[0]
     return _first(first) if isinstance(first, BaseExceptionGroup) else first
