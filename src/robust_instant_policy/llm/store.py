@@ -123,21 +123,11 @@ class SampleStore:
         text = None if answer is None else answer.text
         key = (model, digest, settings, sample)
         where = "WHERE model = ? AND query = ? AND settings = ? AND sample = ?"
+        asked = (query.text, query.instruction, query.grammar, query.pattern, json.dumps(query.stop), query.max_tokens)
         with self._lock:
             self._db.execute("BEGIN IMMEDIATE")
             try:
-                self._db.execute(
-                    "INSERT OR IGNORE INTO queries VALUES (?, ?, ?, ?, ?, ?, ?)",
-                    (
-                        digest,
-                        query.text,
-                        query.instruction,
-                        query.grammar,
-                        query.pattern,
-                        json.dumps(query.stop),
-                        query.max_tokens,
-                    ),
-                )
+                self._db.execute("INSERT OR IGNORE INTO queries VALUES (?, ?, ?, ?, ?, ?, ?)", (digest, *asked))
                 taken = self._db.execute(
                     f"SELECT text FROM answers {where} AND attempt = ?", (*key, attempt)
                 ).fetchone()
