@@ -36,11 +36,6 @@ class Server:
     def counts_tokens(self) -> bool:
         return self.kind in ("llamacpp", "vllm")
 
-    def tokenize_body(self, model: str, text: str) -> dict[str, Any]:
-        """The body of ``POST /tokenize``."""
-        is_llama = self.kind == "llamacpp"
-        return {"content": text, "add_special": True} if is_llama else {"model": model, "prompt": text}
-
 
 Tell = Callable[..., Awaitable[object]]  # address, body -> the server's reply, None when it knows no such address
 

@@ -51,10 +51,10 @@ class Endpoint:
     def __init__(self, url: str, model: str, style: Style | None = None):
         self.name = model
         self.url = url.rstrip("/")
-        self._style: Style | None = style
+        self._style = style
         self._told: dict[str, object] = {}  # replies to questions about the server
         self._server: Server | None = None
-        self._dialect: Dialect | None = None
+        self.dialect = Dialect.first(Server(), style)  # how the server is asked, as far as is known
         self.is_known = False  # an answer has come in the present dialect
 
     @property
@@ -111,20 +111,15 @@ class Endpoint:
                 if failure.absent or time.monotonic() + FIRST_PAUSE_S > end:
                     break
                 await asyncio.sleep(FIRST_PAUSE_S)
-        server = self._server or Server()
-        self._dialect = Dialect.first(server, self._style)
-        return server
-
-    @property
-    def dialect(self) -> Dialect:
-        """How the server is asked, as far as is known; after `learn`."""
-        assert self._dialect is not None
-        return self._dialect
+            else:
+                self.dialect = Dialect.first(self._server, self._style)
+        return self._server or Server()
 
     async def count(self, connection: Connection, server: Server, text: str) -> int:
         """The server's own count of tokens, an estimate where it has none."""
         if server.counts_tokens:
-            body = server.tokenize_body(self.name, text)
+            is_llama = server.kind == "llamacpp"
+            body = {"content": text, "add_special": True} if is_llama else {"model": self.name, "prompt": text}
             with contextlib.suppress(UnavailableError, RefusedError):
                 reply = await connection.request(self.url.removesuffix("/v1") + "/tokenize", body)
                 if isinstance(tokens := as_map(reply).get("tokens"), list):
@@ -163,13 +158,13 @@ class Endpoint:
         except UnreadableReplyError as error:
             raise UnavailableError(f"its reply could not be read ({error})") from None
         self._refuse_truncated(query, reply.answers[0].prompt_tokens)
-        if len(reply.answers) < count and self._dialect == used:
-            self._dialect = replace(used, several=False)
+        if len(reply.answers) < count and self.dialect == used:
+            self.dialect = replace(used, several=False)
         return reply
 
     def make_room(self, used: Dialect, answer: Answer) -> None:
         """Allow more tokens after ``answer`` was cut off; raise `ModelError` at the largest allowance."""
-        if self._dialect != used:
+        if self.dialect != used:
             return
         changed = used.with_more_room()
         if changed is None:
@@ -177,7 +172,7 @@ class Endpoint:
                 f"{self.name} at {self.url} used up {used.margin_tokens} tokens without giving an answer "
                 f"({answer.fault}); switch off or shorten its reasoning in the server, or use another model"
             )
-        self._dialect = changed
+        self.dialect = changed
 
     def _adapt(self, used: Dialect, refusal: RefusedError, body: dict[str, Any]) -> None:
         """Ask differently from now on, or raise `ModelError`.
@@ -190,13 +185,13 @@ class Endpoint:
                 f"the prompt does not fit into the context of {self.name}; use fewer demonstrations or steps, "
                 "or layout='factorised'"
             )
-        if self._dialect != used:
+        if self.dialect != used:
             return
         changed = used.adapted(refusal, body)
         if changed is None:
             advice = "; does the address end in /v1?" if used.tried and refusal.status in (404, 405) else ""
             raise ModelError(f"{self.url} refused the request for {self.name}: {words}{advice}")
-        self._dialect = changed
+        self.dialect = changed
 
     def _refuse_truncated(self, query: Query, read: int) -> None:
         sent = estimate_tokens(query.text)
