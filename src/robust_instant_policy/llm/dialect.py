@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 from urllib.parse import quote, urlsplit
 
-from robust_instant_policy.llm.reply import as_map, token_count
+from robust_instant_policy.llm.reply import as_map, as_text, token_count
 from robust_instant_policy.llm.transport import RefusedError
 from robust_instant_policy.query import Query
 
@@ -51,9 +51,9 @@ async def discover(tell: Tell, url: str, model: str) -> Server:
     owner = entry.get("owned_by")
     root = url.removesuffix("/v1")
     if owner == "llamacpp":
-        template = as_map(await tell(root + "/props")).get("chat_template")
+        template = as_text(as_map(await tell(root + "/props")).get("chat_template"))
         chats = bool(template)
-        if "<|im_start|>" in str(template):
+        if "<|im_start|>" in template:
             # ChatML stands in for a missing template; a model that was trained with it has a token for its mark.
             body = {"content": "<|im_start|>", "add_special": False, "parse_special": True}
             tokens = as_map(await tell(root + "/tokenize", body)).get("tokens")
@@ -67,7 +67,7 @@ async def discover(tell: Tell, url: str, model: str) -> Server:
     if entry:
         about = as_map(await tell(root + "/api/show", {"model": model}))
         if isinstance(template := about.get("template"), str):
-            limit = re.search(r"^num_ctx\s+(\d{1,9})$", str(about.get("parameters")), re.MULTILINE)
+            limit = re.search(r"^num_ctx\s+(\d{1,9})$", as_text(about.get("parameters")), re.MULTILINE)
             is_plain = re.sub(r"\s", "", template) in ("", "{{.Prompt}}")
             return Server("ollama", int(limit[1]) if limit else None, not is_plain)
     return Server("", length)
