@@ -66,9 +66,9 @@ async def discover(tell: Tell, url: str, model: str) -> Server:
         return Server("lmstudio", token_count(about.get("loaded_context_length")) or length, True)
     if entry:
         about = as_map(await tell(root + "/api/show", {"model": model}))
-        if isinstance(template := about.get("template"), str):
+        if isinstance(about.get("template"), str):
             limit = re.search(r"^num_ctx\s+(\d{1,9})$", as_text(about.get("parameters")), re.MULTILINE)
-            is_plain = re.sub(r"\s", "", template) in ("", "{{.Prompt}}")
+            is_plain = re.sub(r"\s", "", about["template"]) in ("", "{{.Prompt}}")
             return Server("ollama", int(limit[1]) if limit else None, not is_plain)
     return Server("", length)
 
