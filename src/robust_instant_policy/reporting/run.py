@@ -1,0 +1,234 @@
+"""The self-contained page about one run: what was seen, proposed, kept and executed."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+from plotly.offline import get_plotlyjs
+
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.files import write_whole
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.policies.policy import Plan, Stage
+from robust_instant_policy.reporting.charts import (
+    MM,
+    ROBUST_COLOUR,
+    candidate_colour,
+    candidate_name,
+    chart,
+    dimensions_over_time,
+    paths_in_space,
+    weights_over_time,
+)
+from robust_instant_policy.reporting.pages import data_uri, render
+from robust_instant_policy.reporting.pictures import (
+    REFERENCE_WIDTH,
+    Line,
+    Picture,
+    keypoint_marks,
+    picture,
+    svg_points,
+    tool_points,
+)
+from robust_instant_policy.reporting.tables import NONE, Table
+from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
+
+SHOWN_DEMONSTRATIONS = 10
+MOSTLY = 0.5  # mean weight below which a hallucinated candidate was ignored more than followed
+RUN_FILE, PLAN_FILE, SEEN_FILE, CONTEXT_FILE, VIDEO_FILE, REPORT_FILE = (
+    "run.json",
+    "plan.json",
+    "observation.npz",
+    "context.npz",
+    "execution.mp4",
+    "report.html",
+)
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What is known of a run beside the plan.
+
+    ``success`` is None where the plan was not executed.
+    """
+
+    task: str
+    description: str
+    seed: int
+    llm: str
+    method: str
+    success: bool | None
+    outcome: str
+    stages: tuple[Stage, ...]
+
+    def save(self, folder: Path) -> None:
+        write_whole(folder / RUN_FILE, (json.dumps(asdict(self), indent=1) + "\n").encode())
+
+    @classmethod
+    def load(cls, folder: Path) -> RunRecord:
+        """Raises `DatasetError` where ``folder`` holds no run, or a damaged one."""
+        try:
+            content = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+            record = cls(**{**content, "stages": tuple(Stage(**stage) for stage in content["stages"])})
+            _stage_table(record.stages)
+            return record
+        except FileNotFoundError:
+            raise DatasetError(f"{folder} holds no run ({RUN_FILE} is missing); make one with: rip demo") from None
+        except (TypeError, ValueError, KeyError) as error:
+            raise DatasetError(f"{folder / RUN_FILE} is damaged: {error}") from None
+
+
+def save_context(folder: Path, images: Sequence[NDArray[np.uint8]], pixels: FloatArray) -> None:
+    """Keep the demonstrations' start images and their keypoints' ``pixels (I, K, 2)`` beside the plan."""
+    arrays = {f"rgb_{index}": image for index, image in enumerate(images)}
+    np.savez_compressed(folder / CONTEXT_FILE, pixels=pixels, **arrays)  # type: ignore[arg-type]
+
+
+def write_report(folder: str | Path) -> Path:
+    """Write ``report.html`` from the other files of a run folder and return its path.
+
+    Raises `DatasetError` where one of them is missing or damaged.
+    """
+    folder = Path(folder)
+    record = RunRecord.load(folder)
+    plan = Plan.load(folder / PLAN_FILE)
+    observation = Observation.load(folder / SEEN_FILE)
+    shown = _load_context(folder / CONTEXT_FILE)
+    video = folder / VIDEO_FILE
+    page = render(
+        "run.html",
+        title=f"{record.task}: {record.outcome}",
+        plotly=Markup(get_plotlyjs()),
+        record=record,
+        shown_count=len(shown),
+        facts=_facts(record, plan),
+        video=data_uri(video.read_bytes(), "video/mp4") if video.exists() else "",
+        overlay=_candidates_over_scene(observation, plan),
+        seen=picture(observation.rgb, "new scene", marks=keypoint_marks(plan.pixels, plan.keypoint_confidence)),
+        shown=shown[:SHOWN_DEMONSTRATIONS],
+        keypoints=_keypoint_table(plan),
+        paths=chart(paths_in_space(plan)),
+        judged=plan.confidence is not None,
+        candidates=_candidate_table(plan),
+        weights=chart(weights_over_time(plan)) if plan.candidates else "",
+        dimensions=chart(dimensions_over_time(plan)),
+        record_confidence=plan.confidence is not None,
+        confidence=_confidence_table(plan),
+        notes=plan.notes,
+        stages=_stage_table(record.stages),
+    )
+    write_whole(folder / REPORT_FILE, page.encode())
+    return folder / REPORT_FILE
+
+
+def _load_context(path: Path) -> list[Picture]:
+    """The demonstrations' start images with their keypoints."""
+    try:
+        with np.load(path, allow_pickle=False) as context:
+            return [
+                picture(context[f"rgb_{index}"], f"demonstration {index}", marks=keypoint_marks(pixels))
+                for index, pixels in enumerate(context["pixels"])
+            ]
+    except FileNotFoundError:
+        raise DatasetError(f"{path} is missing; run rip demo again") from None
+    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        raise DatasetError(f"{path} is damaged ({error}); run rip demo again") from None
+
+
+def _facts(record: RunRecord, plan: Plan) -> dict[str, str]:
+    facts = {
+        "confidence": NONE if plan.confidence is None else f"{plan.confidence:.2f}",
+        "candidates": str(len(plan.candidates)),
+        "of these hallucinated": NONE if plan.confidence is None else str(int(plan.hallucinated.sum())),
+        "planning": f"{plan.usage.seconds:.1f} s",
+        "tokens read and written": f"{plan.usage.tokens:,}",
+    }
+    return {"method": record.method, **facts}
+
+
+def _candidates_over_scene(observation: Observation, plan: Plan) -> Picture:
+    """The scene with the paths of the fingertips, hallucinated candidates dotted red."""
+    unit = observation.rgb.shape[1] / REFERENCE_WIDTH
+
+    def lines(trajectory: Trajectory, colour: str, width: float, dash: str = "", title: str = "") -> list[Line]:
+        return [
+            Line(svg_points(tool_points(trajectory, arm), observation), colour, width * unit, dash, title)
+            for arm in range(trajectory.num_arms)
+        ]
+
+    drawn = lines(plan.trajectory, "#fff", 4.2) + lines(plan.trajectory, ROBUST_COLOUR, 2.6, title="robust trajectory")
+    for index, candidate in enumerate(plan.candidates):
+        dash = f"{2 * unit:.2f}" if plan.hallucinated[index] else ""
+        drawn += lines(candidate, candidate_colour(plan, index), 1.1, dash, candidate_name(plan, index))
+    return picture(observation.rgb, "new scene with the candidates and, black, the trajectory that was planned", drawn)
+
+
+def _keypoint_table(plan: Plan) -> Table:
+    rows = [
+        (str(index), f"{confidence:.2f}", *(f"{MM * value:.0f}" for value in point))
+        for index, (confidence, point) in enumerate(zip(plan.keypoint_confidence, plan.keypoints, strict=True))
+    ]
+    return Table(("keypoint", "confidence", "world x [mm]", "world y [mm]", "world z [mm]"), tuple(rows), "")
+
+
+def _candidate_table(plan: Plan) -> Table:
+    rows = []
+    for index, candidate in enumerate(plan.candidates):
+        weight, onset = plan.weights[index].mean(), int(plan.onset[index])
+        verdict, start = "agrees", NONE
+        if plan.hallucinated[index]:
+            verdict = "**hallucinated**" if weight < MOSTLY else "**hallucinated in part**"
+            # The onset counts the candidate's own steps, which may be more than the plan's.
+            if 0 <= onset < len(candidate):
+                start = f"step {onset} of {len(candidate)} (time {candidate.times[onset]:.2f})"
+        rows.append((str(index + 1), verdict, start, f"{plan.scores[index]:.2f}", f"{weight:.2f}", f"{len(candidate)}"))
+    return Table(("candidate", "verdict", "ignored from", "score", "mean weight", "steps"), tuple(rows), "")
+
+
+def _confidence_table(plan: Plan) -> Table:
+    """The confidence and what it depends on."""
+    lengths = np.arange(plan.scale.shape[1]) % ACTION_DIM != STATE_INDEX
+    scale = MM * plan.scale[:, lengths]
+    rows = [
+        ("candidates that agree", f"{int((~plan.hallucinated).sum())} of {len(plan.candidates)}"),
+        ("scale of the positions, median and largest", f"{np.median(scale):.1f} mm, {scale.max():.1f} mm"),
+    ]
+    if plan.candidates:
+        rows.insert(1, ("mean weight of a candidate", f"{plan.weights.mean():.2f}"))
+    if len(plan.keypoint_confidence):
+        quarter, least = np.quantile(plan.keypoint_confidence, (0.25, 0.0))
+        rows.append(("keypoint confidence, lower quartile and lowest", f"{quarter:.2f}, {least:.2f}"))
+    if plan.confidence is not None:
+        rows.insert(0, ("**confidence**", f"**{plan.confidence:.2f}**"))
+    return Table(("quantity", "value"), tuple(rows), "")
+
+
+def _stage_table(stages: Sequence[Stage]) -> Table:
+    total = Stage(
+        "total",
+        sum(stage.seconds for stage in stages),
+        sum(stage.prompt_tokens for stage in stages),
+        sum(stage.cached_tokens for stage in stages),
+        sum(stage.completion_tokens for stage in stages),
+    )
+    rows = [
+        (
+            stage.name,
+            f"{stage.seconds:.3f}" if stage.seconds < 1 else f"{stage.seconds:.1f}",
+            *(
+                f"{tokens:,}" if tokens else NONE
+                for tokens in (stage.prompt_tokens, stage.cached_tokens, stage.completion_tokens)
+            ),
+        )
+        for stage in (*stages, total)
+    ]
+    rows[-1] = tuple(f"**{cell}**" for cell in rows[-1])
+    return Table(("stage", "seconds", "tokens given", "of these cached", "tokens written"), tuple(rows), "")
