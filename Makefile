@@ -11,12 +11,15 @@ setup:
 demo: setup
 	@$(RIP) demo $(ARGS)
 
-lint: setup
+# Installs nothing.
+lint:
+	@[ -x .venv/bin/ruff ] && [ -x .venv/bin/mypy ] || { echo "the linters are not installed; run: make setup" >&2; exit 1; }
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
-test: lint
+test: setup
+	@$(MAKE) --no-print-directory lint
 	.venv/bin/python -m pytest $(ARGS)
 
 clean:
