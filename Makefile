@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 RIP := .venv/bin/rip
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test coverage lint clean
 
 setup:
 	@scripts/setup.sh
@@ -22,5 +22,9 @@ test: setup
 	@$(MAKE) --no-print-directory lint
 	.venv/bin/python -m pytest $(ARGS)
 
+# The tests with the share of lines that they run; 11 to 33% more processor time on Python 3.11, so not in `make test`.
+coverage:
+	@$(MAKE) --no-print-directory test ARGS="--cov --cov-report=term:skip-covered $(ARGS)"
+
 clean:
-	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage
