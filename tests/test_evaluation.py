@@ -35,14 +35,14 @@ from robust_instant_policy.evaluation import (
 from robust_instant_policy.evaluation.experiment import missing_work, plan_file, wanted_plans
 from robust_instant_policy.evaluation.failures import video_file
 from robust_instant_policy.evaluation.manifest import Manifest, invocation
-from robust_instant_policy.evaluation.publication import publish
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test, wilson_interval
 from robust_instant_policy.evaluation.summary import Summary
-from robust_instant_policy.evaluation.tables import tables
 from robust_instant_policy.evaluation.variant import labels
 from robust_instant_policy.evaluation.work import MAX_DEATHS, Agenda, SceneWork
 from robust_instant_policy.llm import SampleStore
 from robust_instant_policy.query import Answer, Query
+from robust_instant_policy.reporting.publication import publish
+from robust_instant_policy.reporting.tables import tables
 
 RIP = Variant("rip", model="a model")
 KAT = Variant("kat", model="a model")
@@ -250,7 +250,7 @@ def test_every_analysis_has_a_table_even_when_half_is_missing(name):
     row = Episode(**{**vars(row), "scene": scene})
     (table,) = tables(Summary(suite, [row]))
     assert "100" in table.markdown()
-    assert table.html().count("<tr>") == len(table.rows) + 1
+    assert table.markdown().count("\n| ") == len(table.rows) + 1  # the rule below the head, and the rows
 
 
 def test_methods_stand_in_one_order_whichever_was_run_first():

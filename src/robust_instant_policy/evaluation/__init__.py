@@ -1,4 +1,4 @@
-"""Evaluation: suites of rollouts done by workers, rows, statistics, failure analysis, tables and figures."""
+"""Evaluation: suites of rollouts done by workers, rows, statistics, failure analysis."""
 
 from robust_instant_policy.evaluation.episodes import Episode, open_episodes
 from robust_instant_policy.evaluation.experiment import Progress, run_suites

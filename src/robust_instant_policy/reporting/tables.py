@@ -1,10 +1,8 @@
-"""The paper's tables, with intervals and tests that it lacks."""
+"""The paper's tables, with confidence intervals and significance tests."""
 
 from __future__ import annotations
 
-import html
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -32,16 +30,6 @@ class Table:
     def markdown(self) -> str:
         lines = [self.head, tuple("---" for _ in self.head), *self.rows]
         return "\n".join(f"| {' | '.join(line)} |" for line in lines) + f"\n\n{self.note}\n"
-
-    def html(self) -> str:
-        head = "".join(f"<th>{_html(cell)}</th>" for cell in self.head)
-        rows = "".join("<tr>" + "".join(f"<td>{_html(cell)}</td>" for cell in row) + "</tr>" for row in self.rows)
-        return f"<table><tr>{head}</tr>{rows}</table><p class='note'>{_html(self.note)}</p>"
-
-
-def _html(cell: str) -> str:
-    text = re.sub(r"\*\*(\S.*?)\*\*", r"<b>\1</b>", html.escape(cell)).replace("\\*", "*")
-    return re.sub(r"`(.+?)`", r"<code>\1</code>", text)
 
 
 def tables(summary: Summary) -> list[Table]:
@@ -152,7 +140,7 @@ def demos_table(summary: Summary) -> Table:
 
 
 def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> Table:
-    """How the failed episodes of each method share out over the stages that lost them."""
+    """How many failures of each method each stage caused."""
     keys = {row.key for row in episodes}
     known = [failure for failure in failures if failure.key in keys]
     methods = sorted({row.variant.method for row in episodes}, key=METHOD_NAMES.index)
@@ -180,7 +168,7 @@ def invocation_table(invocations: Sequence[Invocation], episodes: Sequence[Episo
     for one in invocations:
         rows.setdefault((one.command, one.machine, one.code), []).append(one.hours)
     models = sorted({row.variant.model for row in episodes if row.variant.model})
-    shared: dict[tuple, float] = {}  # methods that share samples all count the time it took to get them
+    shared: dict[tuple, float] = {}  # methods that share samples each count the time of sampling
     for row in episodes:
         samples = row.scene, row.variant.demos, row.variant.downsampling, row.variant.frames, row.variant.layout
         shared[samples] = max(shared.get(samples, 0.0), row.seconds)
