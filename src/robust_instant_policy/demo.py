@@ -15,7 +15,7 @@ from robust_instant_policy.errors import UnreachableError, UsageError
 from robust_instant_policy.evaluation import obtain_demonstrations, scene_seed
 from robust_instant_policy.evaluation.episodes import holds_episodes
 from robust_instant_policy.llm import connect
-from robust_instant_policy.policies import InstantPolicy, RobustInstantPolicy
+from robust_instant_policy.policies import RobustInstantPolicy
 from robust_instant_policy.report import (
     PLAN_FILE,
     SEEN_FILE,
@@ -62,11 +62,10 @@ def _run(
     with screen.stage(f"language model ({llm_spec})"):
         model = connect(llm_spec)
     try:
-        instant = InstantPolicy(model, workspace=task.workspace, progress=screen.done_so_far, **options)
-        policy = RobustInstantPolicy(instant)
+        policy = RobustInstantPolicy(model, workspace=task.workspace, progress=screen.done_so_far, **options)
         with screen.stage("keypoints of the demonstrations"):
             policy.fit(shown)
-        for note in instant.context.extractor.notes_:
+        for note in policy.context_.notes:
             screen.say(f"    {note}")
         with screen.stage("a new scene"):
             observation = task.reset(scene)
@@ -90,7 +89,7 @@ def _run(
     out.mkdir(parents=True, exist_ok=True)
     plan.save(out / PLAN_FILE)
     observation.save(out / SEEN_FILE)
-    save_context(out, [one.observation.rgb for one in shown], instant.context.extractor.pixels_)
+    save_context(out, [one.observation.rgb for one in shown], policy.context_.pixels)
     with screen.stage("execution"), VideoWriter(out / VIDEO_FILE, fps=task.video_hz) as video:
         try:
             execution = task.execute(plan.trajectory, on_frame=video.add)

@@ -10,7 +10,7 @@ from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.policies import TRAINED_METHODS, KeypointContext, make_trained_policy
+from robust_instant_policy.policies import TRAINED_METHODS, Settings, make_trained_policy
 from robust_instant_policy.policies.training import Training
 from robust_instant_policy.policies.training_picture import training_picture
 from robust_instant_policy.tasks import TASK_NAMES, make_task
@@ -26,7 +26,7 @@ def train(task: str, method: str, demos: Path, limit: int | None, training: Trai
     screen = StageConsole()
     demonstrations = load_demonstrations(demos, task=task, limit=limit)
     policy = make_trained_policy(
-        method, KeypointContext(workspace=_workspace(task)), replace(training, report=TrainingScreen(screen))
+        method, Settings().changed(workspace=_workspace(task)), replace(training, report=TrainingScreen(screen))
     )
     with screen.stage(f"{method} on {len(demonstrations)} demonstrations"):
         policy.fit(demonstrations)

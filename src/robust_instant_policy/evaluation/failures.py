@@ -19,15 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from robust_instant_policy.datasets.video import FILM_OPTIONS, VideoEncoder
-from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError, PlanningError
 from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey
-from robust_instant_policy.evaluation.rollout import execute
+from robust_instant_policy.evaluation.rollout import ScenePolicy, execute
 from robust_instant_policy.evaluation.rows import RowFile
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.perception import Located
 from robust_instant_policy.perception.accuracy import KnownScene, measure
-from robust_instant_policy.policies import ClosedLoopPolicy, KeypointContext, Policy
+from robust_instant_policy.policies import ClosedLoopPolicy, Context, LocatedScene, Stage
 from robust_instant_policy.tasks.task import FrameSink, Task
 from robust_instant_policy.trajectory import Trajectory, downsample
 
@@ -80,15 +80,13 @@ class Truth:
     error: float
 
 
-def true_keypoints(
-    task: Task, seed: int, context: KeypointContext, shown: Sequence[Demonstration], shown_truth: Sequence[KnownScene]
-) -> Truth | None:
-    """Where the keypoints of ``context``, fitted to ``shown``, are in the scene of ``seed``; None where it cannot say.
+def true_keypoints(task: Task, seed: int, context: Context, shown_truth: Sequence[KnownScene]) -> Truth | None:
+    """Where the keypoints of ``context`` are in the scene of ``seed``; None where it cannot say.
 
     ``shown_truth`` is the simulator's knowledge of the demonstrations' own scenes.
     """
     observation = task.reset(seed)
-    images = [demonstration.observation for demonstration in shown]
+    images = [demonstration.observation for demonstration in context.demonstrations]
     try:
         accuracy = measure(context.extractor, images, shown_truth, [observation], [task.scene_truth()])
     except KeypointError:
@@ -110,15 +108,13 @@ class Inquest:
     def examine(
         self,
         episode: Episode,
-        policy: Policy | ClosedLoopPolicy,
+        policy: ScenePolicy | ClosedLoopPolicy,
         observation: Observation,
-        context: KeypointContext,
         truth: Callable[[], Truth | None],
     ) -> Failure:
-        """Lay ``episode``, in which ``policy`` failed from ``observation``, at one stage's door.
+        """Find the stage that lost ``episode``, in which ``policy`` failed from ``observation``.
 
-        ``context`` is what the policy knows of keypoints. Raises `ModelError` where samples are missing that the
-        method would need with the true keypoints.
+        Raises `ModelError` where samples are missing that the method would need with the true keypoints.
         """
         found = Failure(episode.scene, episode.variant, episode.candidate, "policy", True, None, None, None)
         if not self._demonstrator_succeeds(episode.variant.downsampling):
@@ -129,7 +125,7 @@ class Inquest:
         if known is None:
             return replace(found, stage="keypoints")
         self._task.reset(self._scene.seed)
-        better = self._succeeds_with(known.located, policy, observation, context, episode.candidate)
+        better = self._succeeds_with(known.located, policy, episode.candidate)
         found = replace(found, true_keypoints=better, keypoint_error=known.error)
         if better:
             return replace(found, stage="keypoints")
@@ -149,13 +145,9 @@ class Inquest:
             self._replayed[downsampling] = self._plays(downsample(shown, downsampling))
         return self._replayed[downsampling]
 
-    def _succeeds_with(
-        self, located: Located, policy: Policy, observation: Observation, context: KeypointContext, candidate: int
-    ) -> bool:
-        same = replace(observation)  # the same scene, as another object: what was planned before does not count
-        context.assume(same, located)
+    def _succeeds_with(self, located: Located, policy: ScenePolicy, candidate: int) -> bool:
         try:
-            trajectories = policy.executions(policy.plan(same))
+            trajectories = policy.executions(policy.plan_scene(LocatedScene(located, Stage("keypoints", 0.0))))
         except PlanningError:
             return False
         return self._plays(trajectories[min(candidate, len(trajectories) - 1)])
@@ -164,7 +156,7 @@ class Inquest:
         return execute(self._task, trajectory).success
 
 
-def film(task: Task, policy: Policy | ClosedLoopPolicy, observation: Observation, candidate: int) -> bytes:
+def film(task: Task, policy: ScenePolicy | ClosedLoopPolicy, observation: Observation, candidate: int) -> bytes:
     """The episode once more, in the task's scene, as an MP4; empty where nothing moved."""
     encoder = VideoEncoder(task.video_hz, FILM_OPTIONS)
     sink: FrameSink = encoder.add
