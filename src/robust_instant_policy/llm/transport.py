@@ -1,0 +1,234 @@
+"""HTTP with one server: the key, the proxy, bounded replies, and every failure in plain words."""
+
+from __future__ import annotations
+
+import asyncio
+import email.utils
+import ipaddress
+import math
+import os
+import re
+import ssl
+import time
+import urllib.parse
+import urllib.request
+from types import TracebackType
+from typing import Any
+
+import httpx2
+
+from robust_instant_policy.errors import ModelError
+from robust_instant_policy.llm.reply import Complaint, UnreadableReplyError, one_line, read_complaint, read_json
+
+CONNECT_TIMEOUT_S = 5.0
+TLS_PROBE_S = 1.0  # for the handshake that tells whether a port expects TLS
+MAX_REPLY_BYTES = 8 << 20
+LONGEST_RETRY_AFTER_S = 60.0
+_PASSING_STATUS = (408, 409, 425, 429, 500, 502, 503, 504)
+_PASSING_WORDS = re.compile(r"overload|rate.?limit|capacity|too many|try again|unavailable|timed? ?out|loading", re.I)
+
+
+class UnavailableError(Exception):
+    """The request may succeed later. ``wait_s`` is the pause that the server asks for, ``absent`` says that nothing
+    listens at the address."""
+
+    def __init__(self, message: str, wait_s: float = 0.0, absent: bool = False):
+        super().__init__(message)
+        self.wait_s, self.absent = wait_s, absent
+
+
+class RefusedError(Exception):
+    """The server does not accept the request as it is."""
+
+    def __init__(self, status: int, complaint: Complaint):
+        super().__init__(complaint.message)
+        self.status, self.complaint = status, complaint
+
+
+class Connection:
+    """A client of the server at ``url`` (with its ``/v1``), to be used as an asynchronous context manager.
+
+    ``has_answered``: the server is known to speak HTTP at ``url``.
+    """
+
+    def __init__(self, url: str, has_answered: bool = False):
+        self.url = url
+        self._has_answered = has_answered
+        self._key_variable, key = _key(url)
+        headers = {"Accept-Encoding": "identity"} | ({"Authorization": f"Bearer {key}"} if key else {})
+        try:
+            # trust_env would also take passwords from ~/.netrc; proxies are chosen in _proxy.
+            self._client = httpx2.AsyncClient(
+                headers=headers,
+                proxy=_proxy(url),
+                trust_env=False,
+                verify=httpx2.create_ssl_context(),
+                timeout=httpx2.Timeout(None, connect=CONNECT_TIMEOUT_S),
+            )
+        except OSError:
+            raise ModelError(
+                "SSL_CERT_FILE or SSL_CERT_DIR names no readable certificates; correct or unset it"
+            ) from None
+        except (ImportError, ValueError):  # the error's words may hold a password
+            raise ModelError(
+                f"the proxy that the environment names for {url} cannot be used; give it as http://host:port, or "
+                "put the server into no_proxy"
+            ) from None
+
+    async def __aenter__(self) -> Connection:
+        await self._client.__aenter__()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._client.__aexit__(kind, error, trace)
+
+    async def request(self, address: str, body: dict[str, Any] | None = None, timeout_s: float = 5.0) -> Any:
+        """The JSON that ``address`` answers to GET, or to POST where there is a ``body``, within ``timeout_s`` in all.
+
+        Raises `UnavailableError`, `RefusedError`, and `ModelError` for what no other request will mend.
+        """
+        try:
+            async with (
+                asyncio.timeout(timeout_s),
+                self._client.stream("GET" if body is None else "POST", address, json=body) as response,
+            ):
+                self._has_answered = True
+                content = await _content(response)
+        except TimeoutError:
+            raise UnavailableError("it did not answer in time") from None
+        except httpx2.TransportError as error:
+            await self._raise_for_tls(error)
+            reason = one_line(str(error)) or type(error).__name__
+            absent = isinstance(error, httpx2.ConnectError | httpx2.ConnectTimeout)
+            raise UnavailableError(f"the connection failed ({reason})", absent=absent) from None
+        self._raise_for_status(response, content)
+        try:
+            reply = read_json(content)
+        except UnreadableReplyError as error:
+            raise UnavailableError(f"its reply could not be read ({error})") from None
+        if isinstance(reply, dict) and reply.get("error") and not reply.get("choices"):
+            self._raise_for_error_in_success(reply["error"], content)
+        return reply
+
+    def _raise_for_status(self, response: httpx2.Response, content: bytes) -> None:
+        status = response.status_code
+        if response.is_success:
+            return
+        if response.is_redirect:
+            place = one_line(response.headers.get("Location", ""))
+            raise ModelError(f"{self.url} redirects to {place!r}; give the final address instead")
+        complaint = read_complaint(content)
+        if status in (401, 403):
+            raise ModelError(f"{self.url} refused the key ({status}); set {self._key_variable} to a valid one")
+        if "insufficient_quota" in content.decode(errors="replace"):
+            raise ModelError(f"{self.url} refused the request: {complaint.message}")
+        if status in _PASSING_STATUS:
+            raise UnavailableError(f"it answered {status} ({complaint.message})", _retry_after(response.headers))
+        raise RefusedError(status, complaint)
+
+    def _raise_for_error_in_success(self, error: object, content: bytes) -> None:
+        """An error inside HTTP 200, as gateways send it."""
+        complaint = read_complaint(content)
+        code = error.get("code") if isinstance(error, dict) else None
+        status = int(code) if isinstance(code, int | str) and re.fullmatch(r"[45]\d\d", str(code)) else 400
+        if status in _PASSING_STATUS or _PASSING_WORDS.search(complaint.message):
+            raise UnavailableError(f"it answered with an error ({complaint.message})")
+        raise RefusedError(status, complaint)
+
+    async def _raise_for_tls(self, error: httpx2.TransportError) -> None:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, ssl.SSLError):
+            cause = cause.__cause__ or cause.__context__
+        advice = "put its certificate, or its authority's, into a file and name that in SSL_CERT_FILE"
+        if isinstance(cause, ssl.SSLCertVerificationError):
+            if cause.verify_code in (62, 64):  # X509_V_ERR_HOSTNAME_MISMATCH, _IP_ADDRESS_MISMATCH
+                advice = "use the name that its certificate is for"
+            elif cause.verify_code == 10:  # X509_V_ERR_CERT_HAS_EXPIRED
+                advice = "renew it"
+            raise ModelError(f"{self.url} has a certificate that is not trusted ({cause.verify_message}); {advice}")
+        parts = urllib.parse.urlsplit(self.url)
+        if isinstance(cause, ssl.SSLError):
+            if re.search("WRONG_VERSION|RECORD_LAYER|HTTP_REQUEST|UNKNOWN_PROTOCOL", cause.reason or ""):
+                raise ModelError(f"{self.url} does not speak TLS; write http:// instead of https://")
+            raise ModelError(f"{self.url} cannot agree on TLS ({one_line(cause.reason or str(cause))})")
+        closed = isinstance(error, httpx2.RemoteProtocolError | httpx2.ReadError)
+        if self._has_answered or parts.scheme != "http" or not closed:
+            return
+        if await _speaks_tls(parts.hostname or "", parts.port or 80):
+            raise ModelError(f"{self.url} speaks TLS; write https:// instead of http://")
+
+
+async def _content(response: httpx2.Response) -> bytes:
+    if response.headers.get("Content-Encoding", "identity") != "identity":
+        raise httpx2.RemoteProtocolError("the reply is compressed although that was not asked for")
+    content = bytearray()
+    async for chunk in response.aiter_raw():
+        content += chunk
+        if len(content) > MAX_REPLY_BYTES:
+            raise httpx2.RemoteProtocolError(f"the reply is longer than {MAX_REPLY_BYTES >> 20} MB")
+    return bytes(content)
+
+
+async def _speaks_tls(host: str, port: int) -> bool:
+    """Whether a TLS handshake succeeds. Nothing is sent over it, so the certificate does not matter."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    try:
+        async with asyncio.timeout(TLS_PROBE_S):
+            _, writer = await asyncio.open_connection(host, port, ssl=context)
+    except (OSError, TimeoutError):
+        return False
+    writer.close()
+    return True
+
+
+def _key(url: str) -> tuple[str, str]:
+    """The variable that holds the key for ``url``, and the key, empty where it is not set.
+
+    OpenAI's key goes to OpenAI alone. Raises `ModelError` where the key would travel unencrypted, or is none.
+    """
+    parts = urllib.parse.urlsplit(url)
+    host = parts.hostname or ""
+    is_openai = parts.scheme == "https" and (host == "api.openai.com" or host.endswith(".api.openai.com"))
+    variable = "OPENAI_API_KEY" if is_openai else "RIP_API_KEY"
+    key = os.environ.get(variable, "").strip()  # files and pipes leave a line break behind it
+    if not (key.isascii() and key.isprintable()):
+        raise ModelError(f"{variable} holds characters that no key has; set it to the key alone")
+    if key and parts.scheme == "http" and not _is_loopback(host):
+        raise ModelError(
+            f"the key in {variable} would travel unencrypted to {url}; use https or an SSH tunnel, or unset {variable}"
+        )
+    return variable, key
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _proxy(url: str) -> str | None:
+    """The proxy that the environment names for ``url``; none for this machine itself."""
+    parts = urllib.parse.urlsplit(url)
+    host = parts.hostname or ""
+    if _is_loopback(host) or urllib.request.proxy_bypass(host):
+        return None
+    proxies = urllib.request.getproxies()
+    proxy = proxies.get(parts.scheme) or proxies.get("all")
+    return f"http://{proxy}" if proxy and "://" not in proxy else proxy
+
+
+def _retry_after(headers: httpx2.Headers) -> float:
+    """Seconds; 0 where the header is missing or makes no sense. RFC 9110 allows seconds and dates."""
+    value = headers.get("Retry-After", "")
+    try:
+        seconds = float(value)
+    except ValueError:
+        try:
+            seconds = email.utils.parsedate_to_datetime(value).timestamp() - time.time()
+        except (ValueError, OverflowError):
+            return 0.0
+    return min(seconds, LONGEST_RETRY_AFTER_S) if math.isfinite(seconds) and seconds > 0 else 0.0
