@@ -7,8 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from robust_instant_policy.errors import MissingExtraError, UnknownNameError
-from robust_instant_policy.llm import LanguageModel
-from robust_instant_policy.llm.model import DEADLINE_S
+from robust_instant_policy.llm import DEADLINE_S, LanguageModel
 from robust_instant_policy.policies.gp import KeypointRegression
 from robust_instant_policy.policies.instant import KeypointActionTokens
 from robust_instant_policy.policies.neighbours import Neighbours

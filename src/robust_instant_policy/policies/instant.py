@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from robust_instant_policy.checks import checked_positive
-from robust_instant_policy.llm import LanguageModel
-from robust_instant_policy.llm.model import DEADLINE_S
+from robust_instant_policy.llm import DEADLINE_S, LanguageModel
 from robust_instant_policy.policies.aggregation import take_first
 from robust_instant_policy.policies.context import LocatedScene
 from robust_instant_policy.policies.keypoint_policy import KeypointPolicy

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from robust_instant_policy.llm import LanguageModel
-from robust_instant_policy.llm.model import DEADLINE_S
+from robust_instant_policy.llm import DEADLINE_S, LanguageModel
 from robust_instant_policy.policies.aggregation import aggregate
 from robust_instant_policy.policies.confidence import recognition
 from robust_instant_policy.policies.context import LocatedScene

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from robust_instant_policy.errors import PlanningError
-from robust_instant_policy.llm import LanguageModel, Listener, Sampling
-from robust_instant_policy.llm.model import DEADLINE_S, refusal_advice
+from robust_instant_policy.llm import DEADLINE_S, LanguageModel, Listener, Sampling, refusal_advice
 from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.policy import Progress, Stage, no_progress
 from robust_instant_policy.policies.settings import Settings
