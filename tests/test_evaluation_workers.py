@@ -36,7 +36,7 @@ from robust_instant_policy.evaluation.manifest import invocation
 from robust_instant_policy.evaluation.processes import Processes
 from robust_instant_policy.evaluation.publication import publish
 from robust_instant_policy.files import lock_folder
-from robust_instant_policy.policies import KeypointContext, Neighbours
+from robust_instant_policy.policies import LocatedScene, Neighbours, Stage
 from robust_instant_policy.tasks import make_task
 
 SHOWN = 3
@@ -154,10 +154,9 @@ def scene(workbench):
     for demonstration in shown:
         task.reset(demonstration.seed)
         known.append(task.scene_truth())
-    context = KeypointContext(workspace=task.workspace)
-    policy = Neighbours(context).fit(shown)
+    policy = Neighbours(workspace=task.workspace).fit(shown)
     seed = scene_seed(0, 0)
-    truth = true_keypoints(task, seed, context, shown, known)
+    truth = true_keypoints(task, seed, policy.context_, known)
     yield task, policy, task.reset(seed), truth, Scene("push-cube", "seen", seed)
     task.close()
 
@@ -177,6 +176,9 @@ class Told:
     def plan(self, observation):
         return self._change(self._policy.plan(observation))
 
+    def plan_scene(self, scene):
+        return self._change(self._policy.plan_scene(scene))
+
     def executions(self, plan):
         return (plan.trajectory,)
 
@@ -191,17 +193,17 @@ def beside(trajectory):
 def test_a_failure_is_laid_at_keypoints_that_were_off(scene):
     task, policy, observation, truth, place = scene
     assert truth.error < 0.02
-    seen = replace(observation)
-    policy.context.assume(seen, replace(truth.located, keypoints=truth.located.keypoints + np.array([0, 0.12, 0])))
-    assert not task.execute(policy.plan(seen).trajectory).success
-    found = Inquest(task, place).examine(lost(place), policy, seen, policy.context, lambda: truth)
+    off = replace(truth.located, keypoints=truth.located.keypoints + np.array([0, 0.12, 0]))
+    plan = policy.plan_scene(LocatedScene(off, Stage("keypoints", 0.0)))
+    assert not task.execute(plan.trajectory).success
+    found = Inquest(task, place).examine(lost(place), policy, observation, lambda: truth)
     assert (found.stage, found.true_keypoints, found.demonstrator) == ("keypoints", True, True)
 
 
 def test_a_failure_is_laid_at_the_regression_where_a_candidate_would_have_done_it(scene):
     task, policy, observation, truth, place = scene
     told = Told(policy, lambda plan: replace(plan, trajectory=beside(plan.trajectory)))
-    found = Inquest(task, place).examine(lost(place), told, observation, policy.context, lambda: truth)
+    found = Inquest(task, place).examine(lost(place), told, observation, lambda: truth)
     assert (found.stage, found.true_keypoints, found.good_candidate) == ("regression", False, True)
 
 
@@ -213,9 +215,7 @@ def test_a_failure_is_laid_at_the_samples_where_no_candidate_would_have_done_it(
             plan, trajectory=beside(plan.trajectory), candidates=tuple(beside(one) for one in plan.candidates)
         )
 
-    found = Inquest(task, place).examine(
-        lost(place), Told(policy, all_beside), observation, policy.context, lambda: truth
-    )
+    found = Inquest(task, place).examine(lost(place), Told(policy, all_beside), observation, lambda: truth)
     assert (found.stage, found.good_candidate) == ("samples", False)
 
 
@@ -223,7 +223,7 @@ def test_a_failure_is_laid_at_the_execution_where_even_the_demonstrator_fails(sc
     task, policy, observation, truth, place = scene
     execute = task.execute
     monkeypatch.setattr(task, "execute", lambda trajectory, on_frame=None: execute(beside(trajectory), on_frame))
-    found = Inquest(task, place).examine(lost(place), policy, observation, policy.context, lambda: truth)
+    found = Inquest(task, place).examine(lost(place), policy, observation, lambda: truth)
     assert (found.stage, found.demonstrator, found.true_keypoints) == ("execution", False, None)
 
 
