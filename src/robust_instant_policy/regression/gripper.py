@@ -69,7 +69,7 @@ def robust_gripper_trajectory(
     candidates'. ``triangle`` is the gripper, by default measured from the candidates. ``seed`` is the network's.
     ``tolerance``, metres, is what `RobustTrajectory.confidence` is about. ``bends (B,)``, metres, say how sharply such
     a gripper's points turn (see `StudentTRegression`); only "em" asks for them. ``variation (V,)``, metres and evenly
-    spread over time as well, is how far demonstrations differ along the way (see `Prompt`): who strays by less
+    spread over time as well, is how far demonstrations differ along the way (see `InContextPrompt`): who strays by less
     is not called hallucinated. The trajectory does not depend on it.
     """
     if estimator not in ESTIMATORS:
