@@ -75,7 +75,7 @@ def sampled(scenes: int) -> list[Sampled]:
                 [prompt.trajectory(read, scene.keypoints) for read in values],
                 [prompt.trajectory(read, demo.keypoints) for read, demo in zip(values, demos, strict=False)],
                 costs,
-                prompt.second_differences,
+                prompt.curvature,
             )
         )
         print(f"scene {number + 1} of {scenes}", flush=True)

@@ -112,8 +112,8 @@ class Measurement:
             scene=number,
             cold=self._cold,
             single=(*single, *[float("inf")] * (NUM_SAMPLES - len(single))),
-            gaussian=agreed_error(candidates, scene, float("inf"), self._prompt.second_differences),
-            robust=agreed_error(candidates, scene, DOF, self._prompt.second_differences),
+            gaussian=agreed_error(candidates, scene, float("inf"), self._prompt.curvature),
+            robust=agreed_error(candidates, scene, DOF, self._prompt.curvature),
             refused=counts[False],
             answers=counts.total(),
             tokens=sum(one.prompt_tokens - one.cached_tokens + one.completion_tokens for one in every),
@@ -143,10 +143,10 @@ def fitted(demos: Sequence[Scene], frames: Frames, layout: Layout, order: Order)
     return write_prompt(keypoints, [demo.trajectory for demo in demos], frames, layout, order)
 
 
-def agreed_error(candidates: Sequence[Trajectory], scene: Scene, dof: float, second_differences: np.ndarray) -> float:
+def agreed_error(candidates: Sequence[Trajectory], scene: Scene, dof: float, curvature: np.ndarray) -> float:
     if len(candidates) < MIN_CANDIDATES:
         return float("inf")
-    fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof, bends=second_differences)
+    fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof, curvature=curvature)
     return key_error(Trajectory.from_actions(fit.actions), scene.trajectory)
 
 

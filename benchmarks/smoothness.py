@@ -32,7 +32,7 @@ def sharpest_turn(trajectory: Trajectory) -> float:
 
 def turns(context: Context, scene: LocatedScene, proposal: Proposal) -> tuple[list[float], float]:
     """The sharpest turns in the order of `COLUMNS` but the first, and what knowing those shown moves at key steps."""
-    unknown = replace(context, prompt=replace(context.prompt, second_differences=None))
+    unknown = replace(context, prompt=replace(context.prompt, curvature=None))
     gaussian, free, robust = (
         aggregate(known, scene, proposal, Settings(dof=dof)).trajectory
         for known, dof in ((context, np.inf), (unknown, DOF), (context, DOF))

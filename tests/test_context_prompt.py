@@ -179,15 +179,15 @@ def test_an_interpolated_frame_turns_with_either_end_or_by_a_share():
     assert np.allclose(poses[0][:3, :3] @ step @ step, poses[1][:3, :3])
 
 
-def test_expected_second_differences_are_those_of_the_demonstrations_whatever_their_number():
+def test_the_expected_curvature_is_that_of_the_demonstrations_whatever_their_number():
     _, trajectories = demonstrations()
-    expected = align(trajectories).second_differences()
+    expected = align(trajectories).curvature()
     assert expected.shape == (24,)
     assert expected.max() > 3 * expected.min()
-    assert np.allclose(align(trajectories[:1] * 3).second_differences(), align(trajectories[:1]).second_differences())
-    assert (align([trajectories[0].subset([0])]).second_differences() > 0).all()
-    assert write_prompt(*demonstrations(3), "world", "sequence").second_differences.min() == pytest.approx(
-        align(demonstrations(3)[1]).second_differences().max()
+    assert np.allclose(align(trajectories[:1] * 3).curvature(), align(trajectories[:1]).curvature())
+    assert (align([trajectories[0].subset([0])]).curvature() > 0).all()
+    assert write_prompt(*demonstrations(3), "world", "sequence").curvature.min() == pytest.approx(
+        align(demonstrations(3)[1]).curvature().max()
     )
 
 

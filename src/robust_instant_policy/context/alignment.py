@@ -16,8 +16,8 @@ import numpy as np
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
-TURN_MARGIN = 2.0  # a new scene may need this many times the second differences that were shown
-MIN_SECOND_DIFFERENCE_M = 0.003
+CURVATURE_MARGIN = 2.0  # a new scene may need this many times the curvature that was shown
+MIN_CURVATURE_M = 0.003
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,22 +31,22 @@ class AlignedDemonstrations:
     kept: tuple[int, ...]
     key_steps: tuple[int, ...]
 
-    def second_differences(self) -> FloatArray:
+    def curvature(self) -> FloatArray:
         """How sharply the gripper is expected to turn at each step: the standard deviation ``(T,)``, metres, of a
         coordinate's second difference.
 
-        `TURN_MARGIN` times what was shown at that step and its neighbours, because a new scene may need sharper turns,
+        `CURVATURE_MARGIN` times what was shown at that step and its neighbours, because a new scene may need sharper turns,
         a step earlier or later. Two values where there are fewer than three steps.
         """
         demos, steps = self.actions.shape[:2]
         if steps < 3:
-            return np.full(2, MIN_SECOND_DIFFERENCE_M)
+            return np.full(2, MIN_CURVATURE_M)
         arms = self.actions.reshape(demos, steps, -1, ACTION_DIM)
         points = arms[..., :STATE_INDEX].reshape(demos, steps, -1, 3)
         differences = np.diff(points, n=2, axis=1)
         shown = np.sqrt((differences**2).mean(axis=-1).max(axis=-1).mean(axis=0))  # of the point that turns most
         near = np.pad(shown, 2, mode="edge")
-        return np.maximum(TURN_MARGIN * np.max([near[:-2], near[1:-1], near[2:]], axis=0), MIN_SECOND_DIFFERENCE_M)
+        return np.maximum(CURVATURE_MARGIN * np.max([near[:-2], near[1:-1], near[2:]], axis=0), MIN_CURVATURE_M)
 
 
 def align(trajectories: Sequence[Trajectory]) -> AlignedDemonstrations:

@@ -32,8 +32,8 @@ class Prompt(ABC):
     """Serialised demonstrations; made by `write_prompt`.
 
     ``keypoints (I, K, 3)``, metres, are those of the demonstrations that are shown, ``frames`` the frame of each step.
-    Evenly spread over a trajectory, ``second_differences (B,)``, metres, bound how sharply the gripper is expected to
-    turn (see `AlignedDemonstrations.second_differences`), and ``variation (T,)``, metres, is the demonstrations'
+    Evenly spread over a trajectory, ``curvature (B,)``, metres, bound how sharply the gripper is expected to
+    turn (see `AlignedDemonstrations.curvature`), and ``variation (T,)``, metres, is the demonstrations'
     standard deviation in these frames; None in the world frame, where scenes vary too, and of one demonstration.
 
     With ``order`` "nearest-last" the demonstrations whose keypoints are nearest to the new scene's stand last. A server
@@ -42,7 +42,7 @@ class Prompt(ABC):
 
     keypoints: FloatArray
     frames: StepFrames
-    second_differences: FloatArray
+    curvature: FloatArray
     variation: FloatArray | None
     order: Order
 

@@ -47,7 +47,7 @@ def write_prompt(
     num_arms = widths.pop() // ACTION_DIM
 
     aligned = align(trajectories)
-    bounds = aligned.second_differences()
+    bounds = aligned.curvature()
     if frames == "world" and layout == "sequence":  # as in the paper: trajectories as they are, each of its own length
         lengths = [len(trajectory) for trajectory in trajectories]
         pairs = zip(keypoints, map(raw_rows, trajectories), strict=True)

@@ -24,7 +24,7 @@ def aggregate(context: Context, scene: LocatedScene, proposal: Proposal, setting
     """
     watch = Stopwatch()
     with watch.stage("regression"):
-        robust = agree(proposal, settings, context.prompt.second_differences, context.prompt.variation)
+        robust = agree(proposal, settings, context.prompt.curvature, context.prompt.variation)
     # Checks of the trajectory against the demonstrations belong here; what they find is evidence, too.
     evidence = Evidence(robust.confidence, scene.located.confidence)
     return make_plan(context, scene, proposal, robust, plan_confidence(evidence), watch.stages)
@@ -50,7 +50,7 @@ def take_first(context: Context, scene: LocatedScene, proposal: Proposal) -> Pla
 def agree(
     proposal: Proposal,
     settings: Settings,
-    second_differences: ArrayLike | None = None,
+    curvature: ArrayLike | None = None,
     variation: ArrayLike | None = None,
 ) -> RobustTrajectory:
     """What the candidates agree on; see `robust_gripper_trajectory`."""
@@ -61,7 +61,7 @@ def agree(
             dof=settings.dof,
             estimator=settings.estimator,
             seed=settings.seed,
-            bends=second_differences,
+            curvature=curvature,
             variation=variation,
         )
     except InvalidValueError as error:
