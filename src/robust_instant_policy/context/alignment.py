@@ -35,8 +35,8 @@ class AlignedDemonstrations:
         """How sharply the gripper is expected to turn at each step: the standard deviation ``(T,)``, metres, of a
         coordinate's second difference.
 
-        `CURVATURE_MARGIN` times what was shown at that step and its neighbours, because a new scene may need sharper turns,
-        a step earlier or later. Two values where there are fewer than three steps.
+        `CURVATURE_MARGIN` times what was shown at that step and its neighbours, because a new scene may need sharper
+        turns, a step earlier or later. Two values where there are fewer than three steps.
         """
         demos, steps = self.actions.shape[:2]
         if steps < 3:
