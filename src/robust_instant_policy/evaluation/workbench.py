@@ -11,7 +11,7 @@ from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import KeypointError, ModelError, PlanningError
 from robust_instant_policy.evaluation.episodes import Episode
-from robust_instant_policy.evaluation.failures import Inquest, Truth, film, true_keypoints
+from robust_instant_policy.evaluation.failures import FailureAnalysis, Truth, film, true_keypoints
 from robust_instant_policy.evaluation.rollout import roll_out
 from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.variant import Scene, Variant
@@ -162,7 +162,7 @@ class Workbench:
         shown: Sequence[Demonstration],
         observation: Observation,
     ) -> Iterator[Analysis]:
-        inquest = Inquest(task, scene)
+        analysis = FailureAnalysis(task, scene)
         truths: dict[InstantPolicy, Truth | None] = {}
         for episode in failed:
             variant = episode.variant
@@ -179,7 +179,7 @@ class Workbench:
                 return truths[instant]
 
             try:
-                failure = inquest.examine(episode, policy, observation, instant.context, truth)
+                failure = analysis.examine(episode, policy, observation, instant.context, truth)
             except ModelError:
                 if self._setup.replay:  # nobody asked the model what it would have said with the true keypoints
                     continue
