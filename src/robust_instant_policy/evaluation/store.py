@@ -153,11 +153,11 @@ class ResultsStore:
         self._database.execute("BEGIN IMMEDIATE")
         try:
             yield
+            self._database.execute("COMMIT")
         except BaseException:
-            if self._database.in_transaction:  # a full disk has ended it already
+            if self._database.in_transaction:  # a full disk may have ended it already
                 self._database.execute("ROLLBACK")
             raise
-        self._database.execute("COMMIT")
 
 
 class _Table:
@@ -171,12 +171,11 @@ class _Table:
         names = list(self._hints)
         marks = ", ".join(f":{column}" for column in names)
         self._insert = f"INSERT OR IGNORE INTO {name} ({', '.join(names)}) VALUES ({marks})"
-        self._select = f"SELECT {', '.join(names)} FROM {name} ORDER BY rowid"
 
     def create(self, database: sqlite3.Connection) -> None:
-        """Make the table, or give one of an older version the columns that came later."""
+        """Make the table, or add the columns that came after an older version made it."""
         columns = {column: _SQL_TYPES[hint] for column, (hint, _) in self._hints.items()}
-        known = {row[1] for row in database.execute(f"PRAGMA table_info({self._name})")}
+        known = self._known(database)
         if not known:
             database.execute(f"CREATE TABLE {self._name} ({', '.join(map(' '.join, columns.items()))})")
         elif known != set(columns):
@@ -184,17 +183,22 @@ class _Table:
             for column in columns.keys() - known:
                 database.execute(f"ALTER TABLE {self._name} ADD COLUMN {column} {columns[column]}")
                 database.execute(f"UPDATE {self._name} SET {column} = ?", (self._defaults[column],))
-            database.execute(f"DROP INDEX {self._name}_key")
+            database.execute(f"DROP INDEX IF EXISTS {self._name}_key")
         # SQLite takes no two NULL for the same
         key = ", ".join(f"IFNULL({column}, '')" if self._hints[column][1] else column for column in self._key)
         database.execute(f"CREATE UNIQUE INDEX IF NOT EXISTS {self._name}_key ON {self._name} ({key})")
+
+    def _known(self, database: sqlite3.Connection) -> set[str]:
+        return {row[1] for row in database.execute(f"PRAGMA table_info({self._name})")}
 
     def insert(self, database: sqlite3.Connection, row: Any) -> None:
         database.execute(self._insert, _flat(row))
 
     def read(self, database: sqlite3.Connection) -> Iterator[Any]:
-        for values in database.execute(self._select):
-            yield self._row(dict(zip(self._hints, values, strict=True)))
+        known = sorted(self._known(database))
+        self._check(set(known))
+        for values in database.execute(f"SELECT {', '.join(known)} FROM {self._name} ORDER BY rowid"):
+            yield self._row(self._defaults | dict(zip(known, values, strict=True)))
 
     def arrow(self, rows: Iterable[Any]) -> pa.Table:
         schema = pa.schema([(column, _ARROW_TYPES[hint]) for column, (hint, _) in self._hints.items()])
