@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole, TrainingScreen
-from robust_instant_policy.commands.options import natural, positive
+from robust_instant_policy.commands.options import positive, seed
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.files import write_whole
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="dp needs images along the way")
     parser.add_argument("--limit", type=positive, metavar="N", help="show it the first N of them only")
     parser.add_argument("--steps", type=positive, metavar="N", help="of gradient descent")
-    parser.add_argument("--seed", type=natural, default=0)
+    parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where there is one")
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="rip eval --checkpoints DIR finds it there"

@@ -1,20 +1,20 @@
-"""``failures.parquet``: which stage lost a failed episode, found by replacing stages with the truth one by one.
+"""Failure analysis: which stage a failed episode failed in, found by replacing stages with the truth one by one.
 
-The robot, the keypoints, the samples and the regression are asked in this order, and the first that is to blame is:
+Execution, keypoints, regression and samples are checked in this order, and the failure is counted for the first that
+it is due to:
 
-- *execution*: the demonstrator's own trajectory for the scene, thinned out and played back like a plan, fails too;
+- *execution*: the demonstrator's own trajectory for the scene, downsampled and executed like a plan, fails too;
 - *keypoints*: with the true keypoints in place of those that perception found, the same method succeeds;
-- *regression*: one of the very candidates that were aggregated succeeds by itself;
-- *samples*: none of them does, or the candidate that failed is a sample taken at its word.
+- *regression*: one of the candidates that were aggregated succeeds by itself;
+- *samples*: none of them does, or the trajectory that failed is a single sample, not aggregated.
 
-A policy in closed loop has no such stages; beyond the execution, its failures are its own (*policy*).
+A closed-loop policy has no such stages; beyond the execution, its failures are its own (*policy*).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError, PlanningError
 from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey
 from robust_instant_policy.evaluation.rollout import ScenePolicy, execute
-from robust_instant_policy.evaluation.rows import RowFile
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.perception import Located
 from robust_instant_policy.perception.accuracy import KnownScene, measure
@@ -31,14 +30,13 @@ from robust_instant_policy.policies import ClosedLoopPolicy, Context, LocatedSce
 from robust_instant_policy.tasks.task import FrameSink, Task
 from robust_instant_policy.trajectory import Trajectory, downsample
 
-FAILURES_FILE = "failures.parquet"
 VIDEO_FOLDER = "videos"
 STAGES = ("keypoints", "samples", "regression", "execution", "policy")
 
 
 @dataclass(frozen=True)
 class Failure:
-    """The ``stage`` to which a failed episode is laid, and what was found on the way; None where nobody looked.
+    """The ``stage`` that a failed episode is due to, and what was found on the way; None where it was not checked.
 
     ``demonstrator`` says whether the demonstrator's trajectory succeeds when played back, ``true_keypoints`` whether
     the method succeeds with the true keypoints, ``good_candidate`` whether one of the candidates that were aggregated
@@ -57,11 +55,6 @@ class Failure:
     @property
     def key(self) -> EpisodeKey:
         return self.scene, self.variant, self.candidate
-
-
-def open_failures(folder: Path) -> RowFile[Failure]:
-    """The rows of ``folder/failures.parquet``."""
-    return RowFile(Failure, folder / FAILURES_FILE)
 
 
 def video_file(scene: Scene, variant: Variant, candidate: int) -> str:
@@ -98,8 +91,8 @@ def true_keypoints(task: Task, seed: int, context: Context, shown_truth: Sequenc
     return Truth(replace(found, keypoints=known), float(np.nanmax(accuracy.errors)))
 
 
-class Inquest:
-    """Takes the failed episodes of one scene apart; what several of them need is tried only once."""
+class FailureAnalysis:
+    """Analyses the failed episodes of one scene; what several of them need is tried only once."""
 
     def __init__(self, task: Task, scene: Scene):
         self._task, self._scene = task, scene
@@ -112,7 +105,7 @@ class Inquest:
         observation: Observation,
         truth: Callable[[], Truth | None],
     ) -> Failure:
-        """Find the stage that lost ``episode``, in which ``policy`` failed from ``observation``.
+        """Find the stage to which the failure of ``policy`` from ``observation`` in ``episode`` is due.
 
         Raises `ModelError` where samples are missing that the method would need with the true keypoints.
         """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from robust_instant_policy.evaluation.episodes import Episode
@@ -31,15 +31,23 @@ class Rate:
 
 
 class Summary:
-    """The success of the variants of ``suite``, counted from those of ``episodes`` that belong to it."""
+    """The success of the variants of ``suite``, counted from those of ``episodes`` that belong to it.
+
+    Where a variant was shown different demonstrations of one task, those shown last count.
+    """
 
     def __init__(self, suite: Suite, episodes: Iterable[Episode]):
         self.suite = suite
-        scenes, variants = set(suite.scenes), set(suite.variants)
+        scenes = set(suite.scenes)
         self._rows: dict[Variant, list[Episode]] = {variant: [] for variant in suite.variants}
+        shown: dict[tuple[Variant, str], str] = {}
         for row in episodes:
-            if row.variant in variants and row.scene in scenes:
-                self._rows[row.variant].append(row)
+            variant = replace(row.variant, demonstrations="")
+            if variant in self._rows and row.scene in scenes:
+                self._rows[variant].append(row)
+                shown[variant, row.scene.task] = row.variant.demonstrations
+        for variant, rows in self._rows.items():
+            rows[:] = [row for row in rows if row.variant.demonstrations == shown[variant, row.scene.task]]
         self.rows: list[Episode] = [row for rows in self._rows.values() for row in rows]
         known = [variant for variant, rows in self._rows.items() if rows]
         # whatever the order in which they were asked for, run by run

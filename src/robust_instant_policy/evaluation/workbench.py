@@ -15,7 +15,7 @@ from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import KeypointError, ModelError, PlanningError
 from robust_instant_policy.evaluation.episodes import Episode
-from robust_instant_policy.evaluation.failures import Inquest, Truth, film, true_keypoints
+from robust_instant_policy.evaluation.failures import FailureAnalysis, Truth, film, true_keypoints
 from robust_instant_policy.evaluation.rollout import roll_out
 from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.variant import Scene, Variant
@@ -192,7 +192,7 @@ class Workbench:
         shown: Sequence[Demonstration],
         observation: Observation,
     ) -> Iterator[Analysis]:
-        inquest = Inquest(task, scene)
+        analysis = FailureAnalysis(task, scene)
         truths: dict[ContextKey, Truth | None] = {}
 
         def truth(demos: int, settings: Settings) -> Truth | None:
@@ -207,7 +207,7 @@ class Workbench:
             policy, demos = self._policy(episode.variant, shown), episode.variant.demos
             settings = self._settings(episode.variant)
             try:
-                failure = inquest.examine(episode, policy, observation, partial(truth, demos, settings))
+                failure = analysis.examine(episode, policy, observation, partial(truth, demos, settings))
             except ModelError:
                 if self._setup.replay:  # the samples for the true keypoints were never drawn
                     continue
