@@ -1,4 +1,4 @@
-"""The instant policy Φ, and keypoint action tokens, which execute what it says (Di Palo and Johns 2024)."""
+"""Keypoint action tokens: execute what the language model says (Di Palo and Johns 2024)."""
 
 from __future__ import annotations
 

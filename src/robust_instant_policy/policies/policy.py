@@ -171,7 +171,8 @@ def _from_json(content: dict[str, list]) -> Trajectory:
 class Policy(Protocol):
     """Sees demonstrations once, then plans for new observations."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> Policy:
         """Returns itself."""

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 
-from robust_instant_policy.llm import DEADLINE_S, LanguageModel
 from robust_instant_policy.policies.aggregation import aggregate
 from robust_instant_policy.policies.confidence import recognition
 from robust_instant_policy.policies.context import LocatedScene
 from robust_instant_policy.policies.instant import KeypointActionTokens
-from robust_instant_policy.policies.policy import Plan, Progress, no_progress
+from robust_instant_policy.policies.policy import Plan
 from robust_instant_policy.policies.sampling import MIN_CANDIDATES, Samples, count_candidates, propose
-from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.trajectory import Trajectory
 
 ENOUGH_CONFIDENCE = 0.3  # with adaptive queries, no more are asked above it (chosen in docs/prompts.md)
@@ -23,18 +21,11 @@ class RobustInstantPolicy(KeypointActionTokens):
     The options are those of `KeypointActionTokens`; see `Settings` for ``dof``, ``estimator`` and ``adaptive``.
     """
 
-    def __init__(
-        self,
-        llm: LanguageModel | KeypointActionTokens,
-        settings: Settings | None = None,
-        *,
-        deadline_s: float = DEADLINE_S,
-        progress: Progress = no_progress,
-        **options: object,
-    ):
-        super().__init__(llm, settings, deadline_s=deadline_s, progress=progress, **options)
-        gaussian = math.isinf(self.settings.dof)
-        self.name = "rip-gauss" if gaussian else "rip-adaptive" if self.settings.adaptive else "rip"
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        if math.isinf(self.settings.dof):
+            return "rip-gauss"
+        return "rip-adaptive" if self.settings.adaptive else "rip"
 
     def plan_from(self, scene: LocatedScene, earlier: Samples) -> tuple[Plan, Samples]:
         settings, most = self.settings, self.settings.num_queries
