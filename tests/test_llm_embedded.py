@@ -242,3 +242,9 @@ def test_two_model_files_of_one_name_are_told_apart(tmp_path):
 def test_an_unknown_spec_names_the_known_forms(spec):
     with pytest.raises(UsageError, match=r"known forms: 'embedded'|needs its model behind a #"):
         connect(spec)
+
+
+def test_a_number_that_the_token_limit_cut_is_not_taken(embedded):
+    query = Query("1 2\n" * 20, 5, 'root ::= "100 200 300\\n"')
+    (answers,) = embedded.sample([query], Sampling(2, temperature=0.5))
+    assert [answer.text for answer in answers] == ["100 ", "100 "]

@@ -29,7 +29,7 @@ PAIRS = Query(
     stop=("\n",),
     instruction="Continue.",
 )
-FAULT_PLANS = int(os.environ.get("RIP_FAULT_PLANS", "8"))
+FAULT_PLANS = int(os.environ.get("RIP_FAULT_PLANS", "5"))
 FAULT_DEADLINE_S = 3.0
 GRACE_S = 1.0  # scheduling on a busy machine
 DISCOVERY = ("pass",) * 3  # requests in which llama.cpp's server is asked about itself

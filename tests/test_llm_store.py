@@ -18,7 +18,7 @@ from robust_instant_policy.errors import ModelError, UsageError
 from robust_instant_policy.llm import Listener, RecordedModel, ReplayedModel, SampleStore, Sampling, connect
 from robust_instant_policy.llm.model import NOBODY, Tally
 from robust_instant_policy.query import Answer, Query
-from tests.stand_in_server import NOT_FOUND, StandInServer, chat
+from tests.stand_in_server import NOT_FOUND, Request, Response, StandInServer, chat
 
 QUERIES = [Query(f"{number} 1\n", max_tokens=8, grammar="root ::= [0-9]", stop=("\n",)) for number in range(3)]
 
@@ -159,24 +159,30 @@ def test_a_plan_that_failed_fails_in_the_same_words_when_replayed(tmp_path):
 
 
 def test_a_sample_that_missed_the_deadline_is_asked_for_again(tmp_path):
-    """The server is slow at first; what it answers later is kept, and a replay has it."""
-    pause_s = 2.0
-    server = StandInServer(
-        lambda request: chat("4", after_s=pause_s) if request.path.endswith("/completions") else NOT_FOUND
-    )
+    """The server is slow with one of two prompts; what it answers later is kept, and a replay has it."""
+    pause_s = 30.0
+
+    def answer(request: Request) -> Response:
+        if not request.path.endswith("/completions"):
+            return NOT_FOUND
+        is_slow = request.body["messages"][-1]["content"] == QUERIES[1].text
+        return chat("4", "4", after_s=pause_s if is_slow else 0.0)
+
+    server = StandInServer(answer)
     store = SampleStore(tmp_path / "s.sqlite")
 
-    def ask(deadline_s: float) -> list[list[Answer]]:
+    def ask(deadline_s: float) -> list[int]:
         model = RecordedModel(connect(f"{server.url}#m"), store)
-        return model.sample(QUERIES[:2], Sampling(2, 0.5, deadline_s=deadline_s), Listener(is_number))
+        answers = model.sample(QUERIES[:2], Sampling(2, 0.5, deadline_s=deadline_s), Listener(is_number))
+        return [len(own) for own in answers]
 
     try:
-        with pytest.raises(ModelError, match=r"gave no answer within 0\.3 s"):
-            ask(0.3)
+        assert ask(1.5) == [2, 0]
+        assert [len(own) for own in ReplayedModel(store, "m").sample(QUERIES[:2], Sampling(2, 0.5))] == [2, 0]
         pause_s = 0.0
-        assert [[answer.text for answer in own] for own in ask(20)] == [["4", "4"]] * 2
+        assert ask(20) == [2, 2]
         asked = len(server.asked)
-        assert [len(own) for own in ask(20)] == [2, 2]
+        assert ask(20) == [2, 2]
         assert len(server.asked) == asked
     finally:
         server.close()
@@ -240,7 +246,7 @@ def test_each_answer_is_read_once_and_carries_what_it_says(tmp_path):
     asked = QUERIES, Sampling(4, temperature=0.5), Listener(number)
     recorded = RecordedModel(model, store).sample(*asked)
     assert [[answer.value for answer in own] for own in recorded] == [[0, 1, 2, 3]] * 3
-    assert len(read) == model.asked
+    assert len(read) <= model.asked
     assert [[answer.value for answer in own] for own in ReplayedModel(store, "counting").sample(*asked)] == [
         [0, 1, 2, 3]
     ] * 3

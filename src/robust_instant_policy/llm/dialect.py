@@ -15,8 +15,6 @@ from robust_instant_policy.query import Query
 CHAT_MARGINS = (64, 2048, 8192)  # tokens beside the numbers: for a few words, then for growing amounts of thinking
 OPTIONAL_FIELDS = ("seed", "stop", "temperature")  # left out when a server does not take them
 
-# Context lengths in tokens that OpenAI documents but does not tell, by the beginning of the name.
-_OPENAI_CONTEXT = (("gpt-4.1", 1_047_576), ("gpt-4o", 128_000), ("gpt-4-turbo", 128_000), ("gpt-3.5-turbo", 16_385))
 # The field that holds answers to the query's form, by kind of server. Sources: README of llama.cpp's server;
 # vLLM, Structured Outputs (0.12 and later); SGLang, Structured Outputs.
 _CONSTRAINTS = {"llamacpp": "grammar", "vllm": "structured_outputs", "sglang": "regex"}
@@ -38,11 +36,6 @@ class Server:
     def counts_tokens(self) -> bool:
         return self.kind in ("llamacpp", "vllm")
 
-    def tokenize_body(self, model: str, text: str) -> dict[str, Any]:
-        """The body of ``POST /tokenize``."""
-        is_llama = self.kind == "llamacpp"
-        return {"content": text, "add_special": True} if is_llama else {"model": model, "prompt": text}
-
 
 Tell = Callable[..., Awaitable[object]]  # address, body -> the server's reply, None when it knows no such address
 
@@ -50,7 +43,7 @@ Tell = Callable[..., Awaitable[object]]  # address, body -> the server's reply, 
 async def discover(tell: Tell, url: str, model: str) -> Server:
     """Ask the server at ``url`` about itself and ``model``. Raises `UnavailableError` when it cannot be asked now."""
     if (urlsplit(url).hostname or "").endswith("api.openai.com"):
-        return Server("openai", next((n for name, n in _OPENAI_CONTEXT if model.startswith(name)), None), True)
+        return Server("openai", chats=True)
     entry = _entry(await tell(url + "/models"), model)
     meta = as_map(entry.get("meta"))
     lengths = map(token_count, (entry.get("max_model_len"), meta.get("n_ctx"), meta.get("n_ctx_train")))
@@ -66,11 +59,7 @@ async def discover(tell: Tell, url: str, model: str) -> Server:
             tokens = as_map(await tell(root + "/tokenize", body)).get("tokens")
             chats = isinstance(tokens, list) and len(tokens) == 1
         return Server(owner, length, chats)
-    if owner == "vllm":
-        # Its tokenizer applies the chat template, and fails when there is none.
-        chat = {"model": model, "messages": [{"role": "user", "content": "1"}]}
-        return Server(owner, length, "count" in as_map(await tell(root + "/tokenize", chat)))
-    if owner == "sglang":
+    if owner in ("vllm", "sglang"):  # they refuse to chat with a model that has no template
         return Server(owner, length)
     if owner == "organization_owner":
         about = as_map(await tell(f"{root}/api/v0/models/{quote(model)}"))

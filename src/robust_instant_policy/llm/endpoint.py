@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from robust_instant_policy.errors import ModelError
+from robust_instant_policy.errors import ModelError, RipError
 from robust_instant_policy.llm.dialect import Dialect, Server, Style, discover
 from robust_instant_policy.llm.model import (
     NOBODY,
@@ -51,10 +51,10 @@ class Endpoint:
     def __init__(self, url: str, model: str, style: Style | None = None):
         self.name = model
         self.url = url.rstrip("/")
-        self._style: Style | None = style
+        self._style = style
         self._told: dict[str, object] = {}  # replies to questions about the server
         self._server: Server | None = None
-        self._dialect: Dialect | None = None
+        self.dialect = Dialect.first(Server(), style)  # how the server is asked, as far as is known
         self.is_known = False  # an answer has come in the present dialect
 
     @property
@@ -67,7 +67,7 @@ class Endpoint:
 
     def count_tokens(self, text: str) -> int:
         async def count() -> int:
-            async with self.connection() as connection:
+            async with contextlib.aclosing(self.connection()) as connection:
                 return await self.count(connection, await self.learn(connection), text)
 
         return _run(count())
@@ -86,7 +86,7 @@ class Endpoint:
         return Connection(self.url, has_answered=bool(self._told))
 
     async def _facts(self) -> Server:
-        async with self.connection() as connection:
+        async with contextlib.aclosing(self.connection()) as connection:
             return await self.learn(connection)
 
     async def learn(self, connection: Connection, time_s: float = FACTS_TIME_S) -> Server:
@@ -111,25 +111,18 @@ class Endpoint:
                 if failure.absent or time.monotonic() + FIRST_PAUSE_S > end:
                     break
                 await asyncio.sleep(FIRST_PAUSE_S)
-        server = self._server or Server()
-        self._dialect = Dialect.first(server, self._style)
-        return server
-
-    @property
-    def dialect(self) -> Dialect:
-        """How the server is asked, as far as is known; after `learn`."""
-        assert self._dialect is not None
-        return self._dialect
+            else:
+                self.dialect = Dialect.first(self._server, self._style)
+        return self._server or Server()
 
     async def count(self, connection: Connection, server: Server, text: str) -> int:
         """The server's own count of tokens, an estimate where it has none."""
         if server.counts_tokens:
-            body = server.tokenize_body(self.name, text)
+            is_llama = server.kind == "llamacpp"
+            body = {"content": text, "add_special": True} if is_llama else {"model": self.name, "prompt": text}
             with contextlib.suppress(UnavailableError, RefusedError):
-                tokens = as_map(await connection.request(self.url.removesuffix("/v1") + "/tokenize", body)).get(
-                    "tokens"
-                )
-                if isinstance(tokens, list):
+                reply = await connection.request(self.url.removesuffix("/v1") + "/tokenize", body)
+                if isinstance(tokens := as_map(reply).get("tokens"), list):
                     return len(tokens)
         return estimate_tokens(text)
 
@@ -165,13 +158,13 @@ class Endpoint:
         except UnreadableReplyError as error:
             raise UnavailableError(f"its reply could not be read ({error})") from None
         self._refuse_truncated(query, reply.answers[0].prompt_tokens)
-        if len(reply.answers) < count and self._dialect == used:
-            self._dialect = replace(used, several=False)
+        if len(reply.answers) < count and self.dialect == used:
+            self.dialect = replace(used, several=False)
         return reply
 
     def make_room(self, used: Dialect, answer: Answer) -> None:
         """Allow more tokens after ``answer`` was cut off; raise `ModelError` at the largest allowance."""
-        if self._dialect != used:
+        if self.dialect != used:
             return
         changed = used.with_more_room()
         if changed is None:
@@ -179,7 +172,7 @@ class Endpoint:
                 f"{self.name} at {self.url} used up {used.margin_tokens} tokens without giving an answer "
                 f"({answer.fault}); switch off or shorten its reasoning in the server, or use another model"
             )
-        self._dialect = changed
+        self.dialect = changed
 
     def _adapt(self, used: Dialect, refusal: RefusedError, body: dict[str, Any]) -> None:
         """Ask differently from now on, or raise `ModelError`.
@@ -192,13 +185,13 @@ class Endpoint:
                 f"the prompt does not fit into the context of {self.name}; use fewer demonstrations or steps, "
                 "or layout='factorised'"
             )
-        if self._dialect != used:
+        if self.dialect != used:
             return
         changed = used.adapted(refusal, body)
         if changed is None:
             advice = "; does the address end in /v1?" if used.tried and refusal.status in (404, 405) else ""
             raise ModelError(f"{self.url} refused the request for {self.name}: {words}{advice}")
-        self._dialect = changed
+        self.dialect = changed
 
     def _refuse_truncated(self, query: Query, read: int) -> None:
         sent = estimate_tokens(query.text)
@@ -221,9 +214,12 @@ class _Plan:
         self._last_failure = "nothing came back"
 
     async def carry_out(self) -> None:
-        failure: ModelError | None = None
+        failure: RipError | None = None
         try:
-            async with asyncio.timeout(self._sampling.deadline_s), self._endpoint.connection() as connection:
+            async with (
+                asyncio.timeout(self._sampling.deadline_s),
+                contextlib.aclosing(self._endpoint.connection()) as connection,
+            ):
                 server = await self._endpoint.learn(connection, HEAD_START * self._sampling.deadline_s)
                 await self._endpoint.refuse_long(connection, server, self._queries)
                 try:
@@ -235,7 +231,7 @@ class _Plan:
                         self._opened.set()
                         for index in range(1, len(self._queries)):
                             group.create_task(self._fill(connection, index))
-                except* ModelError as errors:
+                except* RipError as errors:
                     failure = _first(errors)
         except TimeoutError:
             pass
@@ -300,7 +296,7 @@ class _Plan:
                 pause = min(2 * pause, LONGEST_PAUSE_S)
 
 
-def _first(errors: BaseExceptionGroup[ModelError]) -> ModelError:
+def _first(errors: BaseExceptionGroup[RipError]) -> RipError:
     """The first of the errors in a group, however deep groups are nested."""
     first = errors.exceptions[0]
     return _first(first) if isinstance(first, BaseExceptionGroup) else first

@@ -24,6 +24,7 @@ from typing import Any
 
 from robust_instant_policy.errors import MissingExtraError, ModelError
 from robust_instant_policy.llm.model import NOBODY, Listener, Sampling, Tally, context_error, sample_seed
+from robust_instant_policy.llm.reply import CUT_OFF, whole_numbers
 from robust_instant_policy.query import Answer, Query
 
 SHORT_TOKENS = 2048  # prompts up to this length, with their answers, run many at a time
@@ -264,6 +265,7 @@ def _complete(server: Any, request: dict[str, Any], deadline: _Deadline) -> Answ
     pieces: list[str] = []
     usage: dict[str, Any] = {}
     failure: list[str] = []
+    finish: set[str] = set()
     start = time.monotonic()
 
     def receive(chunk: dict[str, Any]) -> bool:
@@ -271,6 +273,7 @@ def _complete(server: Any, request: dict[str, Any], deadline: _Deadline) -> Answ
             failure.append(str(chunk["error"].get("message", chunk["error"])))
             return True
         pieces.extend(choice["text"] for choice in chunk.get("choices", ()) if choice["text"])
+        finish.update(choice.get("finish_reason") or "" for choice in chunk.get("choices", ()))
         usage.update(chunk.get("usage") or {})
         return deadline.has_passed
 
@@ -279,12 +282,14 @@ def _complete(server: Any, request: dict[str, Any], deadline: _Deadline) -> Answ
         raise ModelError(f"llama.cpp refused the prompt: {failure[0]}")
     if deadline.has_passed:
         return None
+    text, cut = "".join(pieces), "length" in finish
     return Answer(
-        "".join(pieces),
+        whole_numbers(text) if cut else text,
         prompt_tokens=usage.get("prompt_tokens", 0),
         cached_tokens=usage.get("prompt_tokens_details", {}).get("cached_tokens", 0),
         completion_tokens=len(pieces),
         seconds=time.monotonic() - start,
+        fault=CUT_OFF if cut else "",
     )
 
 

@@ -15,6 +15,7 @@ from robust_instant_policy.llm.model import QUOTED_CHARS, estimate_tokens
 from robust_instant_policy.query import Answer
 
 KEY_VARIABLES = ("OPENAI_API_KEY", "RIP_API_KEY")
+CUT_OFF = "cut off by the token limit"  # a fault of an answer
 MAX_COUNT = 10**9  # a larger number of tokens is not believed
 
 _ESCAPE = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[@-Z\\^_])")  # ANSI: CSI, OSC, others
@@ -134,9 +135,12 @@ def _read_choice(choice: object) -> tuple[str, str, bool, bool]:
             return "", "cut off while still thinking" + (f": {quoted!r}" if quoted else ""), True, True
         refusal = _text(message.get("refusal"))
         return "", f"refused by the model: {one_line(refusal, QUOTED_CHARS)!r}" if refusal else "", False, False
-    if cut:  # the last number may lack digits
-        return _CUT_NUMBER.sub("", text), "cut off by the token limit", True, False
-    return text, "", False, False
+    return (whole_numbers(text), CUT_OFF, True, False) if cut else (text, "", False, False)
+
+
+def whole_numbers(text: str) -> str:
+    """What the token limit left of an answer, without its last number or word: that may lack its end."""
+    return _CUT_NUMBER.sub("", text)
 
 
 def _text(content: object) -> str:

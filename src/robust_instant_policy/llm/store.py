@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import hashlib
 import json
 import sqlite3
@@ -122,21 +123,11 @@ class SampleStore:
         text = None if answer is None else answer.text
         key = (model, digest, settings, sample)
         where = "WHERE model = ? AND query = ? AND settings = ? AND sample = ?"
+        asked = (query.text, query.instruction, query.grammar, query.pattern, json.dumps(query.stop), query.max_tokens)
         with self._lock:
             self._db.execute("BEGIN IMMEDIATE")
             try:
-                self._db.execute(
-                    "INSERT OR IGNORE INTO queries VALUES (?, ?, ?, ?, ?, ?, ?)",
-                    (
-                        digest,
-                        query.text,
-                        query.instruction,
-                        query.grammar,
-                        query.pattern,
-                        json.dumps(query.stop),
-                        query.max_tokens,
-                    ),
-                )
+                self._db.execute("INSERT OR IGNORE INTO queries VALUES (?, ?, ?, ?, ?, ?, ?)", (digest, *asked))
                 taken = self._db.execute(
                     f"SELECT text FROM answers {where} AND attempt = ?", (*key, attempt)
                 ).fetchone()
@@ -227,42 +218,17 @@ class RecordedModel:
     def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """See `LanguageModel.sample`; asks the model only for queries of which the store lacks a sample.
 
-        A sample that was missing at an earlier deadline is asked for again, one refused `MAX_ROUNDS` times is not.
+        A sample that missed an earlier deadline is asked for again, one that was refused `MAX_ROUNDS` times is not.
         """
-        stored = [_look_up(self._store, self.name, query, sampling) for query in queries]
-        found = [_accepted(index, attempts, listener) for index, attempts in enumerate(stored)]
-        unasked = [
-            index
-            for index, attempts in enumerate(stored)
-            if any(
-                own is None and sum(answer is not None for answer in tries) < MAX_ROUNDS
-                for own, tries in zip(found[index], attempts, strict=True)
-            )
-        ]
-        for index in set(range(len(queries))) - set(unasked):
-            _tell(index, sampling, stored[index], found[index], listener)
-        if unasked:
-            self._ask(queries, unasked, sampling, listener, found)
-        return [[answer for answer in own if answer is not None] for own in found]
-
-    def _ask(
-        self,
-        queries: Sequence[Query],
-        unasked: Sequence[int],
-        sampling: Sampling,
-        listener: Listener,
-        found: list[list[Answer | None]],
-    ) -> None:
-        """Ask for the queries ``unasked``, and add to ``found`` what comes for samples that are missing there."""
-        asked = [queries[index] for index in unasked]
-        accept, settings = listener.accept, _settings(sampling)
+        accept = None if listener.accept is None else functools.cache(listener.accept)  # each answer is read once
+        found, unasked = _look_up(self._store, self.name, queries, sampling, replace(listener, accept=accept))
+        if not unasked:
+            return found
+        asked, settings = [queries[index] for index in unasked], _settings(sampling)
 
         def keep(position: int, sample: int, attempt: int, answer: Answer, accepted: bool) -> None:
-            if answer.text or not answer.fault:  # a withheld answer says nothing about the model
+            if answer.text or not answer.fault:  # an answer that was withheld is none to replay
                 self._store.write(self.name, asked[position], settings, sample, attempt, answer)
-            own, place = found[unasked[position]], sample - sampling.first_index
-            if accepted and own[place] is None:
-                own[place] = answer
             if listener.on_answer is not None:
                 listener.on_answer(unasked[position], sample, attempt, answer, accepted)
 
@@ -272,14 +238,19 @@ class RecordedModel:
             keep,
         )
         try:
-            self._model.sample(asked, sampling, to_model)
+            fresh = self._model.sample(asked, sampling, to_model)
         except ModelError as error:
             self._store.write_failure(self.name, queries, sampling, str(error))
             raise
+        for query, answers in zip(asked, fresh, strict=True):
+            if len(answers) < sampling.n:
+                for sample in sampling.indices:
+                    self._store.write(self.name, query, settings, sample, _NOTHING_CAME, None)
+        # What the store holds now, not what came: a sample that was there already stays what it was.
+        kept, _ = _look_up(self._store, self.name, queries, sampling, Listener(accept))
         for index in unasked:
-            for sample, own in zip(sampling.indices, found[index], strict=True):
-                if own is None:
-                    self._store.write(self.name, queries[index], settings, sample, _NOTHING_CAME, None)
+            found[index] = [replace(answer, replayed=False) for answer in kept[index]]
+        return found
 
     def close(self) -> None:
         self._model.close()
@@ -309,60 +280,53 @@ class ReplayedModel:
     def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """See `LanguageModel.sample`; raises what the model raised then, and `ModelError` for a sample that was never
         recorded."""
-        stored = [_look_up(self._store, self.name, query, sampling) for query in queries]
-        found = [_accepted(index, attempts, listener) for index, attempts in enumerate(stored)]
-        unknown = sum(
-            any(
-                own is None and None not in tries and len(tries) < MAX_ROUNDS
-                for own, tries in zip(found[index], attempts, strict=True)
-            )
-            for index, attempts in enumerate(stored)
-        )
-        if unknown:
+        found, unasked = _look_up(self._store, self.name, queries, sampling, listener, is_replay=True)
+        if unasked:
             failure = self._store.read_failure(self.name, queries, sampling)
             raise ModelError(
                 failure
-                or f"{self._store.path} lacks the answers to {unknown} of {len(queries)} prompts of this plan; "
+                or f"{self._store.path} lacks the answers to {len(unasked)} of {len(queries)} prompts of this plan; "
                 "run once without --replay to record them"
             )
-        for index, (attempts, own) in enumerate(zip(stored, found, strict=True)):
-            _tell(index, sampling, attempts, own, listener)
-        answers = [[answer for answer in own if answer is not None] for own in found]
         if listener.on_progress is not None:
-            listener.on_progress(sum(map(len, answers)), len(queries) * sampling.n)
-        return answers
+            listener.on_progress(sum(map(len, found)), len(queries) * sampling.n)
+        return found
 
     def close(self) -> None:
         pass
 
 
-def _look_up(store: SampleStore, model: str, query: Query, sampling: Sampling) -> list[list[Answer | None]]:
-    """All attempts at each sample of a query."""
-    settings = _settings(sampling)
-    return [store.read(model, query, settings, sample) for sample in sampling.indices]
-
-
-def _accepted(index: int, attempts: list[list[Answer | None]], listener: Listener) -> list[Answer | None]:
-    """The first attempt at each sample that the listener accepts, with its value; None without one."""
-    read = ((listener.read(index, answer) for answer in tries if answer is not None) for tries in attempts)
-    return [next((answer for answer in tries if answer is not None), None) for tries in read]
-
-
-def _tell(
-    index: int,
+def _look_up(
+    store: SampleStore,
+    model: str,
+    queries: Sequence[Query],
     sampling: Sampling,
-    attempts: list[list[Answer | None]],
-    found: list[Answer | None],
     listener: Listener,
-) -> None:
-    """Report stored answers as if they had just come."""
-    if listener.on_answer is None:
-        return
-    for sample, tries, own in zip(sampling.indices, attempts, found, strict=True):
-        for attempt, answer in enumerate(tries):
-            if answer is not None:
-                is_own = own is not None and answer.text == own.text
-                listener.on_answer(index, sample, attempt, own if is_own and own else answer, is_own)
+    is_replay: bool = False,
+) -> tuple[list[list[Answer]], list[int]]:
+    """Stored answers to each query, and the indices of queries of which a sample has to be asked for.
+
+    In a replay a sample for which nothing came is not missing.
+    """
+    found: list[list[Answer]] = []
+    unasked = []
+    settings = _settings(sampling)
+    for index, query in enumerate(queries):
+        attempts = [store.read(model, query, settings, sample) for sample in sampling.indices]
+        heard = [[answer for answer in tries if answer is not None] for tries in attempts]
+        read = [next(filter(None, (listener.read(index, answer) for answer in tries)), None) for tries in heard]
+        found.append([answer for answer in read if answer is not None])
+        if any(
+            own is None and len(come) < MAX_ROUNDS and not (is_replay and None in tries)
+            for own, come, tries in zip(read, heard, attempts, strict=True)
+        ):
+            unasked.append(index)
+        elif listener.on_answer is not None:
+            for sample, own, come in zip(sampling.indices, read, heard, strict=True):
+                for attempt, answer in enumerate(come):
+                    is_own = own == answer
+                    listener.on_answer(index, sample, attempt, own if is_own and own else answer, is_own)
+    return found, unasked
 
 
 def _settings(sampling: Sampling) -> str:

@@ -11,8 +11,6 @@ import re
 import ssl
 import time
 import urllib.parse
-import urllib.request
-from types import TracebackType
 from typing import Any
 
 import httpx2
@@ -46,7 +44,7 @@ class RefusedError(Exception):
 
 
 class Connection:
-    """A client of the server at ``url`` (with its ``/v1``), to be used as an asynchronous context manager.
+    """A client of the server at ``url`` (with its ``/v1``).
 
     ``has_answered``: the server is known to speak HTTP at ``url``.
     """
@@ -57,11 +55,9 @@ class Connection:
         self._key_variable, key = _key(url)
         headers = {"Accept-Encoding": "identity"} | ({"Authorization": f"Bearer {key}"} if key else {})
         try:
-            # trust_env would also take passwords from ~/.netrc; proxies are chosen in _proxy.
             self._client = httpx2.AsyncClient(
                 headers=headers,
-                proxy=_proxy(url),
-                trust_env=False,
+                trust_env=not _is_loopback(urllib.parse.urlsplit(url).hostname or ""),  # the environment's proxies
                 verify=httpx2.create_ssl_context(),
                 timeout=httpx2.Timeout(None, connect=CONNECT_TIMEOUT_S),
             )
@@ -75,14 +71,8 @@ class Connection:
                 "put the server into no_proxy"
             ) from None
 
-    async def __aenter__(self) -> Connection:
-        await self._client.__aenter__()
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self._client.__aexit__(kind, error, trace)
+    async def aclose(self) -> None:
+        await self._client.aclose()
 
     async def request(self, address: str, body: dict[str, Any] | None = None, timeout_s: float = 5.0) -> Any:
         """The JSON that ``address`` answers to GET, or to POST where there is a ``body``, within ``timeout_s`` in all.
@@ -103,39 +93,32 @@ class Connection:
             reason = one_line(str(error)) or type(error).__name__
             absent = isinstance(error, httpx2.ConnectError | httpx2.ConnectTimeout)
             raise UnavailableError(f"the connection failed ({reason})", absent=absent) from None
-        self._raise_for_status(response, content)
+        if not response.is_success:
+            raise self._failure(response.status_code, response.headers, content)
         try:
             reply = read_json(content)
         except UnreadableReplyError as error:
             raise UnavailableError(f"its reply could not be read ({error})") from None
         if isinstance(reply, dict) and reply.get("error") and not reply.get("choices"):
-            self._raise_for_error_in_success(reply["error"], content)
+            # Gateways send errors inside HTTP 200.
+            code = reply["error"].get("code") if isinstance(reply["error"], dict) else None
+            passes = _PASSING_WORDS.search(read_complaint(content).message)
+            status = str(code) if re.fullmatch(r"[45]\d\d", str(code)) else "503" if passes else "400"
+            raise self._failure(int(status), response.headers, content)
         return reply
 
-    def _raise_for_status(self, response: httpx2.Response, content: bytes) -> None:
-        status = response.status_code
-        if response.is_success:
-            return
-        if response.is_redirect:
-            place = one_line(response.headers.get("Location", ""))
-            raise ModelError(f"{self.url} redirects to {place!r}; give the final address instead")
+    def _failure(self, status: int, headers: httpx2.Headers, content: bytes) -> Exception:
         complaint = read_complaint(content)
+        if 300 <= status < 400:
+            place = one_line(headers.get("Location", ""))
+            return ModelError(f"{self.url} redirects to {place!r}; give the final address instead")
         if status in (401, 403):
-            raise ModelError(f"{self.url} refused the key ({status}); set {self._key_variable} to a valid one")
-        if "insufficient_quota" in content.decode(errors="replace"):
-            raise ModelError(f"{self.url} refused the request: {complaint.message}")
+            return ModelError(f"{self.url} refused the key ({status}); set {self._key_variable} to a valid one")
+        if b"insufficient_quota" in content:
+            return ModelError(f"{self.url} refused the request: {complaint.message}")
         if status in _PASSING_STATUS:
-            raise UnavailableError(f"it answered {status} ({complaint.message})", _retry_after(response.headers))
-        raise RefusedError(status, complaint)
-
-    def _raise_for_error_in_success(self, error: object, content: bytes) -> None:
-        """An error inside HTTP 200, as gateways send it."""
-        complaint = read_complaint(content)
-        code = error.get("code") if isinstance(error, dict) else None
-        status = int(code) if isinstance(code, int | str) and re.fullmatch(r"[45]\d\d", str(code)) else 400
-        if status in _PASSING_STATUS or _PASSING_WORDS.search(complaint.message):
-            raise UnavailableError(f"it answered with an error ({complaint.message})")
-        raise RefusedError(status, complaint)
+            return UnavailableError(f"it answered {status} ({complaint.message})", _retry_after(headers))
+        return RefusedError(status, complaint)
 
     async def _raise_for_tls(self, error: httpx2.TransportError) -> None:
         cause: BaseException | None = error
@@ -149,10 +132,8 @@ class Connection:
                 advice = "renew it"
             raise ModelError(f"{self.url} has a certificate that is not trusted ({cause.verify_message}); {advice}")
         parts = urllib.parse.urlsplit(self.url)
-        if isinstance(cause, ssl.SSLError):
-            if re.search("WRONG_VERSION|RECORD_LAYER|HTTP_REQUEST|UNKNOWN_PROTOCOL", cause.reason or ""):
-                raise ModelError(f"{self.url} does not speak TLS; write http:// instead of https://")
-            raise ModelError(f"{self.url} cannot agree on TLS ({one_line(cause.reason or str(cause))})")
+        if isinstance(cause, ssl.SSLError) and re.search("WRONG_VERSION|RECORD_LAYER|HTTP_REQUEST", cause.reason or ""):
+            raise ModelError(f"{self.url} does not speak TLS; write http:// instead of https://")
         closed = isinstance(error, httpx2.RemoteProtocolError | httpx2.ReadError)
         if self._has_answered or parts.scheme != "http" or not closed:
             return
@@ -208,17 +189,6 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-def _proxy(url: str) -> str | None:
-    """The proxy that the environment names for ``url``; none for this machine itself."""
-    parts = urllib.parse.urlsplit(url)
-    host = parts.hostname or ""
-    if _is_loopback(host) or urllib.request.proxy_bypass(host):
-        return None
-    proxies = urllib.request.getproxies()
-    proxy = proxies.get(parts.scheme) or proxies.get("all")
-    return f"http://{proxy}" if proxy and "://" not in proxy else proxy
 
 
 def _retry_after(headers: httpx2.Headers) -> float:
