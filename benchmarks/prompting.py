@@ -28,7 +28,7 @@ from robust_instant_policy.context import Frames, Layout, Order, Prompt, write_p
 from robust_instant_policy.errors import ModelError
 from robust_instant_policy.llm import LanguageModel, Listener, Sampling, connect
 from robust_instant_policy.query import Query
-from robust_instant_policy.regression import robust_gripper_trajectory
+from robust_instant_policy.regression import DEFAULT_DOF, robust_gripper_trajectory
 from robust_instant_policy.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[1]
@@ -36,7 +36,6 @@ KEPT, TABLE = ROOT / "results" / "prompting.jsonl", ROOT / "docs" / "tables" / "
 NUM_DEMOS = 10
 NUM_SAMPLES = 5  # Q
 MIN_CANDIDATES = 3
-DOF = 1.5
 FIRST_NEW_SEED = 1000  # demonstrations count from 0
 
 
@@ -113,7 +112,7 @@ class Measurement:
             cold=self._cold,
             single=(*single, *[float("inf")] * (NUM_SAMPLES - len(single))),
             gaussian=agreed_error(candidates, scene, float("inf"), self._prompt.curvature),
-            robust=agreed_error(candidates, scene, DOF, self._prompt.curvature),
+            robust=agreed_error(candidates, scene, DEFAULT_DOF, self._prompt.curvature),
             refused=counts[False],
             answers=counts.total(),
             tokens=sum(one.prompt_tokens - one.cached_tokens + one.completion_tokens for one in every),

@@ -18,10 +18,11 @@ from stored_proposals import NUM_DEMOS, arguments, proposals
 
 from robust_instant_policy.evaluation.tables import Table
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.policies import DOF, Context, LocatedScene, Proposal, Settings, aggregate
+from robust_instant_policy.policies import Context, LocatedScene, Proposal, Settings, aggregate
+from robust_instant_policy.regression import DEFAULT_DOF
 from robust_instant_policy.trajectory import Trajectory
 
-COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, bends unknown", "robust")
+COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, curvature unknown", "robust")
 
 
 def sharpest_turn(trajectory: Trajectory) -> float:
@@ -35,7 +36,7 @@ def turns(context: Context, scene: LocatedScene, proposal: Proposal) -> tuple[li
     unknown = replace(context, prompt=replace(context.prompt, curvature=None))
     gaussian, free, robust = (
         aggregate(known, scene, proposal, Settings(dof=dof)).trajectory
-        for known, dof in ((context, np.inf), (unknown, DOF), (context, DOF))
+        for known, dof in ((context, np.inf), (unknown, DEFAULT_DOF), (context, DEFAULT_DOF))
     )
     paths = (proposal.candidates[0], gaussian, free, robust)
     return [sharpest_turn(path) for path in paths], key_error(robust, free)

@@ -7,8 +7,9 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
-from robust_instant_policy.policies import ASKING_METHODS, DOF, REGRESSING_METHODS, TRAINED_METHODS
+from robust_instant_policy.policies import ASKING_METHODS, REGRESSING_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import DEFAULT_STEPS
+from robust_instant_policy.regression import DEFAULT_DOF
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Variant:
     method: str
     demos: int = 10
     queries: int = 5
-    dof: float | None = DOF
+    dof: float | None = DEFAULT_DOF
     downsampling: str = "masked"
     frames: str = "adaptive"
     layout: str = "factorised"

@@ -23,12 +23,11 @@ from robust_instant_policy.policies.neighbours import Neighbours
 from robust_instant_policy.policies.policy import ClosedLoopPolicy, Plan, Policy, Progress, Stage, Usage
 from robust_instant_policy.policies.rip import RobustInstantPolicy
 from robust_instant_policy.policies.sampling import Proposal, Samples, propose, sample
-from robust_instant_policy.policies.settings import DOF, Settings
+from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.policies.training import Training
 
 __all__ = [
     "ASKING_METHODS",
-    "DOF",
     "IMAGE_METHODS",
     "METHOD_NAMES",
     "REGRESSING_METHODS",

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 from robust_instant_policy.checks import checked_positive, checked_whole
 from robust_instant_policy.context import Frames, Layout
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError, UsageError
+from robust_instant_policy.regression import DEFAULT_DOF
 from robust_instant_policy.regression.gripper import ESTIMATORS
 from robust_instant_policy.trajectory import TARGET_STEPS
 
-DOF = 1.5  # ν of the paper, chosen there for the success rate
 DOWNSAMPLING = ("masked", "uniform")
 WORDS = {
     "frames": get_args(Frames),
@@ -47,7 +47,7 @@ class Settings:
     temperature: float = 0.7
     num_queries: int = 5
     adaptive: bool = False
-    dof: float = DOF
+    dof: float = DEFAULT_DOF
     estimator: str = "em"
 
     def __post_init__(self) -> None:

@@ -60,7 +60,7 @@ def diagnose(fit: Fit, candidates: Sequence[ArrayLike], times: Sequence[ArrayLik
 
 
 def scaled_residuals(fit: Fit, data: Candidates, variation: FloatArray | None = None) -> FloatArray:
-    """Candidates less the robust trajectory ``(N, D)``, over the scale; each step up to `TIMING_TOLERANCE` early or late.
+    """Candidates less the robust trajectory ``(N, D)``, over the scale, within `TIMING_TOLERANCE`.
 
     ``variation (V,)``, evenly spread over [0, 1], is the standard deviation of demonstrations, where it is known:
     where they differ, candidates may differ as well.
