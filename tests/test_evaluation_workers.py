@@ -38,9 +38,9 @@ from robust_instant_policy.evaluation import (
 from robust_instant_policy.evaluation.cluster import RayWorkers
 from robust_instant_policy.evaluation.failures import FailureAnalysis, film, true_keypoints, video_file
 from robust_instant_policy.evaluation.processes import LocalWorkers
-from robust_instant_policy.evaluation.publication import publish
 from robust_instant_policy.files import lock_folder
 from robust_instant_policy.policies import KeypointContext, Neighbours
+from robust_instant_policy.reporting.publication import publish
 from robust_instant_policy.tasks import make_task
 
 SHOWN = 3
