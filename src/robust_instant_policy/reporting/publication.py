@@ -7,9 +7,9 @@ from pathlib import Path
 
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.experiment import TRAINING_FOLDER, plan_file
+from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.evaluation.store import read_results
 from robust_instant_policy.evaluation.suites import CHOSEN
-from robust_instant_policy.evaluation.summary import Summary
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.policies import Plan
