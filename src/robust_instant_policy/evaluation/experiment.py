@@ -80,15 +80,15 @@ def run_suites(
     ):
         episodes = store.results().episodes
         trials = _with_demonstrations(wanted_trials(suites), episodes, setup, progress, keep)
+        left = executions_left(episodes)
         if keep:
-            begun = {_of_any_code(row.trial) for row in episodes} - {row.trial for row in episodes}
-            trials = [trial for trial in trials if _of_any_code(trial) not in begun]
-        elif repeated := _superseded(trials, episodes):
+            complete = {_of_any_code(trial) for trial, count in left.items() if count == 0}
+            trials = [trial for trial in trials if trial in left or _of_any_code(trial) not in complete]
+        if repeated := _superseded(trials, episodes):
             progress.note(
                 f"{repeated} plans were executed with other code, demonstrations, features or deadline; these rows "
                 "stay apart, and the plans are executed again (--keep leaves out what only the code tells apart)"
             )
-        left = executions_left(episodes)
         done = sum(left.get(trial) == 0 for trial in trials)
         progress.outcome(done, len(trials), None)
         drawn = set(wanted_trials(suite for suite in suites if suite.keeps_plans))
