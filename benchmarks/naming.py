@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from stored_proposals import NUM_DEMOS, NUM_QUERIES, arguments, proposals
 
-from robust_instant_policy.evaluation import STORE_FILE, Variant, open_episodes
-from robust_instant_policy.evaluation.tables import Table
+from robust_instant_policy.evaluation import STORE_FILE, Variant, read_results
 from robust_instant_policy.llm import model_name
 from robust_instant_policy.policies import Settings, aggregate
+from robust_instant_policy.reporting.tables import Table
 
 COLUMNS = ("fail, named", "succeed, named", "fail, named without", "succeed, named without")
 NOTE = "Candidates that fail or succeed when executed alone, in scenes in which RIP succeeds."
@@ -27,7 +27,7 @@ NOTE = "Candidates that fail or succeed when executed alone, in scenes in which 
 def executions(run: Path, task: str, llm: str) -> tuple[set[int], dict[int, list[bool]]]:
     """Seeds of the scenes in which `rip` succeeded, and which of each scene's candidates did by themselves."""
     rip, kat = (Variant(name, NUM_DEMOS, NUM_QUERIES, model=model_name(llm)) for name in ("rip", "kat"))
-    rows = [row for row in open_episodes(run).rows if (row.scene.task, row.scene.objects) == (task, "seen")]
+    rows = [row for row in read_results(run).episodes if (row.scene.task, row.scene.objects) == (task, "seen")]
     good = {row.scene.seed for row in rows if row.variant == rip and row.success}
     alone: dict[int, list[bool]] = {}
     for row in sorted((row for row in rows if row.variant == kat), key=lambda row: row.candidate):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import resource
 import sqlite3
@@ -37,15 +38,14 @@ from robust_instant_policy.evaluation import (
 )
 from robust_instant_policy.evaluation.experiment import missing_work, plan_file, wanted_trials
 from robust_instant_policy.evaluation.failures import video_file
-from robust_instant_policy.evaluation.publication import publish
-from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test, wilson_interval
-from robust_instant_policy.evaluation.summary import Summary
-from robust_instant_policy.evaluation.tables import tables
+from robust_instant_policy.evaluation.statistics import Summary, mark, paired_test, t_test, wilson_interval
 from robust_instant_policy.evaluation.variant import labels
 from robust_instant_policy.evaluation.work import SceneWork
 from robust_instant_policy.evaluation.workers import MAX_DEATHS, Agenda
 from robust_instant_policy.llm import SampleStore
 from robust_instant_policy.query import Answer, Query
+from robust_instant_policy.reporting.publication import publish
+from robust_instant_policy.reporting.tables import tables
 
 RIP = Variant("rip", model="a model")
 KAT = Variant("kat", model="a model")
@@ -318,7 +318,7 @@ def test_every_analysis_has_a_table_even_when_half_is_missing(name):
     row = Episode(**{**vars(row), "scene": scene})
     (table,) = tables(Summary(suite, [row]))
     assert "100" in table.markdown()
-    assert table.html().count("<tr>") == len(table.rows) + 1
+    assert all(len(row) == len(table.head) for row in table.rows)
 
 
 def test_methods_stand_in_one_order_whichever_was_run_first():
@@ -440,6 +440,24 @@ def test_what_table1_shows_has_no_section_of_its_own_in_the_report(tmp_path):
     publish(tmp_path)
     assert (tmp_path / "table1.md").exists()
     assert not (tmp_path / "chosen.md").exists()
+
+
+def test_a_terminal_that_knows_ascii_only_shows_other_signs(tmp_path):
+    folder = tmp_path / "Läufe"
+    a_run(folder, Suite("table1", ("push-cube",), (RIP,), (1,)), [episode(RIP, 1, True)], [])
+    code = "import sys; from robust_instant_policy.cli import main; sys.exit(main())"
+    ascii_only = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-c", code, "report", str(folder)]
+    done = subprocess.run(command, env=ascii_only, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.search(r"L\?+ufe", done.stdout)
+
+
+def test_a_table_of_commands_that_is_not_utf_8_is_told_in_one_line(tmp_path, capsys):
+    an_export(tmp_path, episode(RIP, 1, True))
+    (tmp_path / "run.json").write_bytes('{"suites": "ä"}'.encode("latin-1"))
+    assert main(["report", str(tmp_path)]) == 1
+    assert "run.json is damaged" in capsys.readouterr().err
 
 
 def test_objects_of_code_and_downloaded_ones_have_a_table_each(tmp_path):

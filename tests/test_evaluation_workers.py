@@ -38,9 +38,9 @@ from robust_instant_policy.evaluation import (
 from robust_instant_policy.evaluation.cluster import RayWorkers
 from robust_instant_policy.evaluation.failures import FailureAnalysis, film, true_keypoints, video_file
 from robust_instant_policy.evaluation.processes import LocalWorkers
-from robust_instant_policy.evaluation.publication import publish
 from robust_instant_policy.files import lock_folder
 from robust_instant_policy.policies import LocatedScene, Neighbours, Stage
+from robust_instant_policy.reporting.publication import publish
 from robust_instant_policy.tasks import make_task
 
 SHOWN = 3
@@ -68,18 +68,12 @@ def setup_in(folder: Path, data: Path) -> Setup:
 
 @pytest.fixture(scope="module")
 def interrupted(workbench, tmp_path_factory) -> tuple[Path, int, str]:
-    """Folder, exit status and last words of an evaluation with one worker, stopped with Ctrl-C after three scenes.
-
-    Its output goes to a terminal that knows ASCII only.
-    """
+    """Folder, exit status and last words of an evaluation with one worker, stopped with Ctrl-C after three scenes."""
     folder = tmp_path_factory.mktemp("interrupted")
     code = "import sys; from robust_instant_policy.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "eval", "--methods", "neighbours", "--demos", str(SHOWN)]
     command += ["--tasks", "push-cube", "--episodes", "300", "--no-videos", "--out", str(folder)]
-    ascii_only = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
-    process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=workbench, env=ascii_only
-    )
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=workbench)
     assert process.stdout is not None
     seen = 0
     for line in process.stdout:
@@ -259,6 +253,14 @@ def scene(workbench):
     truth = true_keypoints(task, seed, policy.context_, known)
     yield task, policy, task.reset(seed), truth, Scene("push-cube", "seen", seed)
     task.close()
+
+
+def test_a_seed_that_the_simulator_cannot_take_draws_a_scene_too(scene):
+    task = scene[0]
+    seeds = [scene_seed(seed, 0) for seed in (4_294_868, 10**30)]
+    first, second, again = (task.reset(seed).rgb for seed in (*seeds, seeds[0]))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, second)
 
 
 def lost(scene: Scene) -> Episode:

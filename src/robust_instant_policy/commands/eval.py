@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole, TrainingScreen
@@ -22,11 +23,12 @@ from robust_instant_policy.evaluation import (
 )
 from robust_instant_policy.evaluation.cluster import RayWorkers
 from robust_instant_policy.evaluation.processes import LocalWorkers
-from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
 from robust_instant_policy.evaluation.store import EPISODES_FILE
 from robust_instant_policy.evaluation.work import Outcome, Workers
 from robust_instant_policy.llm import model_name
 from robust_instant_policy.policies.training import DEFAULT_STEPS
+from robust_instant_policy.reporting.publication import PAGE_FILE, publish
+from robust_instant_policy.reporting.training import keep_training_picture
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -116,7 +118,9 @@ def evaluate(
             screen.say(f"  {what.scene} {what.variant} #{what.candidate}: {verdict}")
         screen.done_so_far("plans executed", done, total)
 
-    progress = Progress(recording, outcome, TrainingScreen(screen), screen.say)
+    progress = Progress(
+        recording, outcome, TrainingScreen(screen), trained=partial(keep_training_picture, out), note=screen.say
+    )
     with screen.stage("evaluation"):
         run_suites(suites, setup, out, workers, progress, arguments, keep)
     screen.say("")

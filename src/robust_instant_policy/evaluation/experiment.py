@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.evaluation.episodes import Episode, Trial
@@ -28,8 +29,10 @@ from robust_instant_policy.llm import model_name
 from robust_instant_policy.perception.network import resolve_features
 from robust_instant_policy.policies import IMAGE_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import TrainingReport, no_report
-from robust_instant_policy.policies.training_picture import training_picture
 from robust_instant_policy.tasks import make_task
+
+if TYPE_CHECKING:  # it needs the extra "train"
+    from robust_instant_policy.policies.diffusion.training import TrainedPolicy
 
 PLAN_FOLDER, TRAINING_FOLDER = "plans", "training"
 
@@ -41,13 +44,14 @@ def ignore(*_: object) -> None:
 @dataclass(frozen=True)
 class Progress:
     """Called as the run goes on: ``recording(task, there, wanted, thrown away)``, ``outcome(trials done, trials wanted,
-    what has just come, or None at the start)``, ``training`` while a method is trained, and ``note`` with a line that
-    the user should read.
+    what has just come, or None at the start)``, ``training`` while a method is trained, ``trained(task, variant,
+    policy)`` when that is done, and ``note`` with a line that the user should read.
     """
 
     recording: Callable[[str, int, int, int], None] = ignore
     outcome: Callable[[int, int, Outcome | None], None] = ignore
     training: TrainingReport = no_report
+    trained: Callable[[str, Variant, TrainedPolicy], None] = ignore
     note: Callable[[str], None] = ignore
 
 
@@ -76,15 +80,15 @@ def run_suites(
     ):
         episodes = store.results().episodes
         trials = _with_demonstrations(wanted_trials(suites), episodes, setup, progress, keep)
+        left = executions_left(episodes)
         if keep:
-            begun = {_of_any_code(row.trial) for row in episodes} - {row.trial for row in episodes}
-            trials = [trial for trial in trials if _of_any_code(trial) not in begun]
-        elif repeated := _superseded(trials, episodes):
+            complete = {_of_any_code(trial) for trial, count in left.items() if count == 0}
+            trials = [trial for trial in trials if trial in left or _of_any_code(trial) not in complete]
+        if repeated := _superseded(trials, episodes):
             progress.note(
                 f"{repeated} plans were executed with other code, demonstrations, features or deadline; these rows "
                 "stay apart, and the plans are executed again (--keep leaves out what only the code tells apart)"
             )
-        left = executions_left(episodes)
         done = sum(left.get(trial) == 0 for trial in trials)
         progress.outcome(done, len(trials), None)
         drawn = set(wanted_trials(suite for suite in suites if suite.keeps_plans))
@@ -92,7 +96,7 @@ def run_suites(
         works = missing_work(trials, kept, episodes, store.results().failures, out, setup.films)
         if not works:
             return
-        _train_missing(works, setup, out, progress)
+        _train_missing(works, setup, progress)
         for outcome in workers(setup, works):
             if isinstance(outcome, Episode):
                 store.add(outcome)
@@ -266,8 +270,8 @@ def _record(
         task.close()
 
 
-def _train_missing(works: Sequence[SceneWork], setup: Setup, out: Path, progress: Progress) -> None:
-    """Have checkpoints of everything that is trained, before workers would all train it at once, and pictures of it."""
+def _train_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:
+    """Have checkpoints of everything that is trained, before workers would all train it at once."""
     trained: dict[tuple[str, Variant], SceneWork] = {}
     for work in works:
         for variant in work.concerned:
@@ -277,8 +281,4 @@ def _train_missing(works: Sequence[SceneWork], setup: Setup, out: Path, progress
         return
     with closing(Workbench(setup, report=progress.training)) as bench:
         for (task, variant), work in trained.items():
-            policy = bench.train(work, variant)
-            picture = out / training_file(task, variant)
-            if not picture.exists():
-                picture.parent.mkdir(exist_ok=True)
-                write_whole(picture, training_picture(policy))
+            progress.trained(task, variant, bench.train(work, variant))

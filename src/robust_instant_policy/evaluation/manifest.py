@@ -61,14 +61,6 @@ class Manifest:
         text = json.dumps(asdict(self), indent=1) + "\n"  # an infinite ν is written as Infinity, as Python reads it
         write_whole(path, text.encode())
 
-    def joined(self, other: Manifest) -> Manifest:
-        """What both of them say, each command once."""
-        known = {suite.identity: suite for suite in self.suites}
-        for suite in other.suites:
-            known[suite.identity] = known[suite.identity].merged(suite) if suite.identity in known else suite
-        commands = dict.fromkeys((*self.invocations, *other.invocations))
-        return Manifest(tuple(known.values()), tuple(sorted(commands, key=lambda command: command.began)))
-
 
 @cache
 def code_digest() -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shlex
 import sqlite3
 import time
@@ -140,10 +141,13 @@ class ResultsStore:
             _EPISODES.insert(self._database, episode)
         for failure in results.failures:
             _FAILURES.insert(self._database, failure)
-        for suite in _read_suites(self._database).joined(Manifest(results.manifest.suites)).suites:
+        known = {(suite.name, suite.objects, suite.assets): suite for suite in _read_suites(self._database)}
+        for suite in results.manifest.suites:
+            identity = suite.name, suite.objects, suite.assets
+            known[identity] = known[identity].merged(suite) if identity in known else suite
             self._database.execute(
                 "INSERT INTO suites VALUES (?, ?, ?, ?) ON CONFLICT DO UPDATE SET content = excluded.content",
-                (suite.name, suite.objects, suite.assets, json.dumps(asdict(suite))),
+                (*identity, json.dumps(asdict(known[identity]))),
             )
         for command in results.manifest.invocations:
             _INVOCATIONS.insert(self._database, command)
@@ -209,7 +213,7 @@ class _Table:
         if not path.exists():
             return
         try:
-            table = pq.read_table(path)
+            table = pq.read_table(pa.BufferReader(path.read_bytes()))  # any name, whatever the locale
         except (pa.ArrowException, OSError) as error:
             raise DatasetError(f"{path} cannot be read ({error}); move it away to start again") from None
         self._check(set(table.schema.names), path)
@@ -277,13 +281,13 @@ _INVOCATIONS = _Table("invocations", Invocation, _flat_hints(Invocation))
 
 def _read(database: sqlite3.Connection) -> Results:
     invocations = sorted(_INVOCATIONS.read(database), key=lambda command: command.began)
-    manifest = Manifest(_read_suites(database).suites, tuple(invocations))
+    manifest = Manifest(_read_suites(database), tuple(invocations))
     return Results(tuple(_EPISODES.read(database)), tuple(_FAILURES.read(database)), manifest)
 
 
-def _read_suites(database: sqlite3.Connection) -> Manifest:
+def _read_suites(database: sqlite3.Connection) -> tuple[Suite, ...]:
     contents = database.execute("SELECT content FROM suites ORDER BY rowid")
-    return Manifest(tuple(Suite.from_json(json.loads(content)) for (content,) in contents))
+    return tuple(Suite.from_json(json.loads(content)) for (content,) in contents)
 
 
 def _read_exports(folder: Path) -> Results:
@@ -306,7 +310,7 @@ def _write_exports(folder: Path, results: Results) -> None:
 
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
-    address = f"file:{quote(str(path.absolute()))}?mode={mode}"
+    address = f"file:{quote(os.fsencode(path.absolute()))}?mode={mode}"
     database = sqlite3.connect(address, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
     database.execute("PRAGMA synchronous=FULL")
     return database

@@ -56,10 +56,6 @@ class Suite:
         return cls(**{**content, **sequences, "variants": variants})
 
     @property
-    def identity(self) -> tuple[str, str, str]:
-        return self.name, self.objects, self.assets
-
-    @property
     def scenes(self) -> list[Scene]:
         return [Scene(task, self.objects, seed, self.assets) for task in self.tasks for seed in self.seeds]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property, partial
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
@@ -37,11 +37,13 @@ from robust_instant_policy.policies import (
 )
 from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.policies.training import TrainingReport, no_report
-from robust_instant_policy.policies.training_picture import TrainedPolicy
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Task
 from robust_instant_policy.trajectory import Trajectory
+
+if TYPE_CHECKING:  # it needs the extra "train"
+    from robust_instant_policy.policies.diffusion.training import TrainedPolicy
 
 ContextKey = tuple[int, Settings]  # number of demonstrations, and what decides the context beside them
 DemonstrationSource = Callable[[str, int], list[Demonstration]]  # task, how many
@@ -94,7 +96,7 @@ class Workbench:
         """Make and train the policy of ``variant`` for the scenes of ``work``, as `run` would."""
         self._enter(work.scene)
         policy = self._policy(variant, self._show(work))
-        return cast(TrainedPolicy, policy.policy if isinstance(policy, RememberingPolicy) else policy)
+        return cast("TrainedPolicy", policy.policy if isinstance(policy, RememberingPolicy) else policy)
 
     def close(self) -> None:
         if self._task is not None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import html
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -13,8 +11,7 @@ from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import STAGES, Failure
 from robust_instant_policy.evaluation.manifest import Invocation
-from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test
-from robust_instant_policy.evaluation.summary import Rate, Summary, reference
+from robust_instant_policy.evaluation.statistics import Rate, Summary, mark, paired_test, reference, t_test
 from robust_instant_policy.evaluation.variant import Variant, by_demos, labels, values
 from robust_instant_policy.policies import METHOD_NAMES
 
@@ -32,16 +29,6 @@ class Table:
     def markdown(self) -> str:
         lines = [self.head, tuple("---" for _ in self.head), *self.rows]
         return "\n".join(f"| {' | '.join(line)} |" for line in lines) + f"\n\n{self.note}\n"
-
-    def html(self) -> str:
-        head = "".join(f"<th>{_html(cell)}</th>" for cell in self.head)
-        rows = "".join("<tr>" + "".join(f"<td>{_html(cell)}</td>" for cell in row) + "</tr>" for row in self.rows)
-        return f"<table><tr>{head}</tr>{rows}</table><p class='note'>{_html(self.note)}</p>"
-
-
-def _html(cell: str) -> str:
-    text = re.sub(r"\*\*(\S.*?)\*\*", r"<b>\1</b>", html.escape(cell)).replace("\\*", "*")
-    return re.sub(r"`(.+?)`", r"<code>\1</code>", text)
 
 
 def tables(summary: Summary) -> list[Table]:
