@@ -48,7 +48,7 @@ class KeypointActionTokens(KeypointPolicy):
         return take_first(self.context_, scene, proposal), samples
 
     def sample(self, scene: LocatedScene, earlier: Samples, num_queries: int) -> Samples:
-        """See `sample.sample`."""
+        """See `sampling.sample`."""
         return sample(
             self.context_, scene, self.llm, self.settings, num_queries, self.deadline_s, earlier, self.progress
         )
