@@ -99,6 +99,12 @@ _JSON = st.one_of(_REPLIES, _VALUES).map(lambda value: json.dumps(value).encode(
 _NESTED = st.tuples(st.sampled_from([b"[", b'{"error":', b'{"choices":[']), st.integers(1, 20_000)).map(
     lambda pair: pair[0] * pair[1]
 )
+_LONG = st.builds(
+    lambda piece, count, finish: json.dumps({"choices": [{"text": piece * count, "finish_reason": finish}]}).encode(),
+    st.sampled_from(["a", "1 ", "-1.5", "\x1b[", "\x1b]0;", "<think>", "</think>", "key-"]),
+    st.integers(1, 100_000),
+    st.sampled_from(["stop", "length"]),
+)
 _CUT = st.tuples(_JSON, st.integers(0, 200)).map(lambda pair: pair[0][: pair[1]])
 
-SERVER_REPLIES: st.SearchStrategy[bytes] = st.one_of(_JSON, _CUT, _NESTED, st.binary(max_size=200))
+SERVER_REPLIES: st.SearchStrategy[bytes] = st.one_of(_JSON, _CUT, _NESTED, _LONG, st.binary(max_size=200))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 from urllib.parse import quote, urlsplit
 
-from robust_instant_policy.llm.reply import as_map, token_count
+from robust_instant_policy.llm.reply import as_map, as_text, token_count
 from robust_instant_policy.llm.transport import RefusedError
 from robust_instant_policy.query import Query
 
@@ -44,16 +44,17 @@ async def discover(tell: Tell, url: str, model: str) -> Server:
     """Ask the server at ``url`` about itself and ``model``. Raises `UnavailableError` when it cannot be asked now."""
     if (urlsplit(url).hostname or "").endswith("api.openai.com"):
         return Server("openai", chats=True)
-    entry = _entry(await tell(url + "/models"), model)
+    models = as_map(await tell(url + "/models")).get("data")
+    entry = _entry(models, model)
     meta = as_map(entry.get("meta"))
     lengths = map(token_count, (entry.get("max_model_len"), meta.get("n_ctx"), meta.get("n_ctx_train")))
     length = next((number for number in lengths if number), None)
     owner = entry.get("owned_by")
     root = url.removesuffix("/v1")
     if owner == "llamacpp":
-        template = as_map(await tell(root + "/props")).get("chat_template")
+        template = as_text(as_map(await tell(root + "/props")).get("chat_template"))
         chats = bool(template)
-        if "<|im_start|>" in str(template):
+        if "<|im_start|>" in template:
             # ChatML stands in for a missing template; a model that was trained with it has a token for its mark.
             body = {"content": "<|im_start|>", "add_special": False, "parse_special": True}
             tokens = as_map(await tell(root + "/tokenize", body)).get("tokens")
@@ -64,19 +65,18 @@ async def discover(tell: Tell, url: str, model: str) -> Server:
     if owner == "organization_owner":
         about = as_map(await tell(f"{root}/api/v0/models/{quote(model)}"))
         return Server("lmstudio", token_count(about.get("loaded_context_length")) or length, True)
-    if entry:
+    if models:
         about = as_map(await tell(root + "/api/show", {"model": model}))
-        if isinstance(template := about.get("template"), str):
-            limit = re.search(r"^num_ctx\s+(\d{1,9})$", str(about.get("parameters")), re.MULTILINE)
-            is_plain = re.sub(r"\s", "", template) in ("", "{{.Prompt}}")
+        if isinstance(about.get("template"), str):
+            limit = re.search(r"^num_ctx\s+(\d{1,9})$", as_text(about.get("parameters")), re.MULTILINE)
+            is_plain = re.sub(r"\s", "", about["template"]) in ("", "{{.Prompt}}")
             return Server("ollama", int(limit[1]) if limit else None, not is_plain)
     return Server("", length)
 
 
-def _entry(reply: object, model: str) -> dict[str, Any]:
+def _entry(models: object, model: str) -> dict[str, Any]:
     """The model's entry in the list of models, or the only one."""
-    data = as_map(reply).get("data")
-    entries = [entry for entry in data if isinstance(entry, dict)] if isinstance(data, list) else []
+    entries = [entry for entry in models if isinstance(entry, dict)] if isinstance(models, list) else []
     return next((entry for entry in entries if entry.get("id") == model), entries[0] if len(entries) == 1 else {})
 
 

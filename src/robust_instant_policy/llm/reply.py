@@ -16,13 +16,14 @@ from robust_instant_policy.query import Answer
 
 KEY_VARIABLES = ("OPENAI_API_KEY", "RIP_API_KEY")
 CUT_OFF = "cut off by the token limit"  # a fault of an answer
+MAX_ANSWER_CHARS = 1 << 18  # a hundred times the longest answer; the rest is not read
+MAX_MESSAGE_CHARS = 10_000  # of an error, likewise
 MAX_COUNT = 10**9  # a larger number of tokens is not believed
 
 _ESCAPE = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[@-Z\\^_])")  # ANSI: CSI, OSC, others
 # How reasoning models mark their thinking: DeepSeek and Qwen, Magistral, and gpt-oss (harmony).
 _THINKING = re.compile(r"<think(?:ing)?>|\[THINK\]|<\|channel\|>analysis<\|message\|>")
 _THOUGHT = re.compile(r"</think(?:ing)?>|\[/THINK\]|<\|channel\|>final<\|message\|>")
-_CUT_NUMBER = re.compile(r"[\w.+-]+$")
 
 
 class UnreadableReplyError(Exception):
@@ -120,8 +121,9 @@ def _read_choice(choice: object) -> tuple[str, str, bool, bool]:
     message = as_map(choice.get("message"))
     if "message" not in choice and not isinstance(choice.get("text"), str):
         raise UnreadableReplyError("its choice holds neither message nor text")
-    text = clean(_text(message.get("content")) if "message" in choice else choice["text"])
-    thinking = clean(_text(message.get("reasoning_content")) or _text(message.get("reasoning")))
+    content = _text(message.get("content")) if "message" in choice else choice["text"]
+    text = clean(content[:MAX_ANSWER_CHARS])
+    thinking = _text(message.get("reasoning_content")) or _text(message.get("reasoning"))
     finish = choice.get("finish_reason")
     if finish == "content_filter":
         return "", "withheld by the server's content filter", False, False
@@ -130,9 +132,10 @@ def _read_choice(choice: object) -> tuple[str, str, bool, bool]:
     if not before and (begin := _THINKING.search(text)):
         thinking, text = text[begin.end() :], ""
     if not text.strip():
+        if cut and thinking:
+            return "", f"cut off while still thinking: {one_line(thinking, QUOTED_CHARS)!r}", True, True
         if cut:
-            quoted = one_line(thinking, QUOTED_CHARS)
-            return "", "cut off while still thinking" + (f": {quoted!r}" if quoted else ""), True, True
+            return "", CUT_OFF, True, False
         refusal = _text(message.get("refusal"))
         return "", f"refused by the model: {one_line(refusal, QUOTED_CHARS)!r}" if refusal else "", False, False
     return (whole_numbers(text), CUT_OFF, True, False) if cut else (text, "", False, False)
@@ -140,14 +143,21 @@ def _read_choice(choice: object) -> tuple[str, str, bool, bool]:
 
 def whole_numbers(text: str) -> str:
     """What the token limit left of an answer, without its last number or word: that may lack its end."""
-    return _CUT_NUMBER.sub("", text)
+    stop = len(text)
+    while stop and (text[stop - 1].isalnum() or text[stop - 1] in "_.+-"):
+        stop -= 1
+    return text[:stop]
 
 
 def _text(content: object) -> str:
     """A message's content: a string, null, or a list of parts."""
     if isinstance(content, list):
-        return "".join(_text(as_map(part).get("text")) for part in content)
-    return content if isinstance(content, str) else ""
+        return "".join(as_text(as_map(part).get("text")) for part in content)
+    return as_text(content)
+
+
+def as_text(value: object) -> str:
+    return value if isinstance(value, str) else ""
 
 
 def as_map(value: object) -> dict[str, Any]:
@@ -173,6 +183,7 @@ def clean(text: str) -> str:
 
 def one_line(words: str, length: int = 200) -> str:
     """A server's words for a message: cleaned, one short line, without anything that looks like a key."""
+    words = words[:MAX_MESSAGE_CHARS]
     for variable in KEY_VARIABLES:
         if key := os.environ.get(variable, "").strip():
             words = words.replace(key, "***")

@@ -103,7 +103,8 @@ class Connection:
             # Gateways send errors inside HTTP 200.
             code = reply["error"].get("code") if isinstance(reply["error"], dict) else None
             passes = _PASSING_WORDS.search(read_complaint(content).message)
-            status = str(code) if re.fullmatch(r"[45]\d\d", str(code)) else "503" if passes else "400"
+            code = str(code) if isinstance(code, int | str) else ""
+            status = code if re.fullmatch(r"[45]\d\d", code) else "503" if passes else "400"
             raise self._failure(int(status), response.headers, content)
         return reply
 
