@@ -187,6 +187,17 @@ def test_intervals_cover_the_truth_as_often_as_they_say(style, num, hallucinated
     assert 0.82 <= np.mean(covered) <= 0.97  # of few scenes; the benchmark measures it
 
 
+@pytest.mark.parametrize("num", [3, 5])
+def test_scale_and_error_are_those_of_the_noise_with_few_candidates(num):
+    rng = np.random.default_rng(0)
+    fits = [
+        StudentTRegression(np.inf, groups=np.zeros(3)).fit(0.002 * rng.normal(size=(num, 40, 3))) for _ in range(10)
+    ]
+    assert np.mean([fit.scale() for fit in fits]) == pytest.approx(0.002, rel=0.07)
+    errors = np.sqrt(np.mean([fit.standard_error() ** 2 for fit in fits]))
+    assert errors == pytest.approx(0.002 / np.sqrt(num), rel=0.07)
+
+
 @pytest.mark.parametrize(
     ("candidates", "message"),
     [
@@ -252,6 +263,8 @@ def test_other_bad_arguments_are_refused():
     fit = StudentTRegression().fit([np.zeros((4, 2))])
     with pytest.raises(InvalidValueError, match=r"times must be \(T,\)"):
         fit.mean(np.zeros((2, 2)))
+    with pytest.raises(InvalidValueError, match="3 dimensions"):
+        diagnose(fit, [np.zeros((4, 3))])
     for level in (1.5, 0, np.nan, "0.9", True):
         with pytest.raises(InvalidValueError, match="level"):
             fit.interval(level)

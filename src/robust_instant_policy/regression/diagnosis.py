@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression.candidates import Candidates
 
@@ -34,8 +35,6 @@ class Fit(Protocol):
     def mean(self, times: ArrayLike | None = None) -> FloatArray: ...
 
     def scale(self, times: ArrayLike | None = None) -> FloatArray: ...
-
-    def standard_error(self, times: ArrayLike | None = None) -> FloatArray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +55,8 @@ class Diagnosis:
 def diagnose(fit: Fit, candidates: Sequence[ArrayLike], times: Sequence[ArrayLike] | None = None) -> Diagnosis:
     """Verdict on ``candidates``, each ``(T_q, D)``, of which ``fit`` is the robust trajectory."""
     data = Candidates.from_arrays(candidates, times)
+    if data.num_dimensions != fit.mean(data.times[:1]).shape[1]:
+        raise InvalidValueError(f"candidates have {data.num_dimensions} dimensions, but the fit has others")
     return judge(data.split(scaled_residuals(fit, data)))
 
 
