@@ -224,6 +224,7 @@ def test_a_folder_with_parquet_files_only_is_read_and_goes_on(tmp_path):
     lost = episode(RIP, 1, False)
     an_export(tmp_path, lost, Failure(*lost.key, "samples", True, False, 0.01, False))
     parquet = (tmp_path / "episodes.parquet").read_bytes()
+    (tmp_path / "results.sqlite").touch()  # as one that was killed when it had just begun
     results = read_results(tmp_path)
     assert (results.episodes, results.failures[0].key) == ((lost,), lost.key)
     assert (tmp_path / "episodes.parquet").read_bytes() == parquet
