@@ -233,5 +233,5 @@ def test_the_report_of_an_evaluation_shows_what_was_learned(workbench, demonstra
     (picture,) = (tmp_path / "run" / "training").glob("push-cube-kat-dp-*-5steps.svg")
     assert "demonstration 2" in picture.read_text()
     page = (tmp_path / "run" / "index.html").read_text()
-    assert page.count("<h2 id=training>") == page.count("href='#training'") == 1
+    assert page.count('<h2 id="training">') == page.count('href="#training"') == 1
     assert picture.stem in page

@@ -5,6 +5,7 @@ import math
 import os
 import re
 import resource
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -38,6 +39,7 @@ from robust_instant_policy.evaluation import (
 )
 from robust_instant_policy.evaluation.experiment import missing_work, plan_file, wanted_trials
 from robust_instant_policy.evaluation.failures import video_file
+from robust_instant_policy.evaluation.manifest import PACKAGE, code_digest
 from robust_instant_policy.evaluation.statistics import Summary, mark, paired_test, t_test, wilson_interval
 from robust_instant_policy.evaluation.variant import labels
 from robust_instant_policy.evaluation.work import SceneWork
@@ -224,6 +226,7 @@ def test_a_folder_with_parquet_files_only_is_read_and_goes_on(tmp_path):
     lost = episode(RIP, 1, False)
     an_export(tmp_path, lost, Failure(*lost.key, "samples", True, False, 0.01, False))
     parquet = (tmp_path / "episodes.parquet").read_bytes()
+    (tmp_path / "results.sqlite").touch()  # as one that was killed when it had just begun
     results = read_results(tmp_path)
     assert (results.episodes, results.failures[0].key) == ((lost,), lost.key)
     assert (tmp_path / "episodes.parquet").read_bytes() == parquet
@@ -249,6 +252,21 @@ def test_a_store_of_an_older_version_gets_the_columns_that_came_later(tmp_path):
     assert read_results(tmp_path).episodes == (episode(RIP, 1, True),)
     keep(tmp_path, episode(RIP, 1, False), episode(replace(RIP, code="new"), 1, False))
     assert read_results(tmp_path).episodes == (episode(RIP, 1, True), episode(replace(RIP, code="new"), 1, False))
+
+
+def test_code_that_decides_results_makes_other_rows_and_a_command_does_not(tmp_path):
+    def digest_after(changed: str | None) -> str:
+        copy = tmp_path / str(changed).replace("/", "-")
+        shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+        if changed is not None:
+            with (copy / changed).open("a") as file:
+                file.write("\n")
+        return code_digest(copy)
+
+    same = ("commands/eval.py", "reporting/tables.py", "evaluation/store.py")
+    deciding = ("policies/rip.py", "evaluation/rollout.py", "tasks/maniskill/ur5e_hande.urdf")
+    assert {digest_after(None), *map(digest_after, same)} == {code_digest()}
+    assert len({code_digest(), *map(digest_after, deciding)}) == 1 + len(deciding)
 
 
 def test_any_seed_draws_a_scene_of_its_own_that_tables_can_hold(tmp_path):

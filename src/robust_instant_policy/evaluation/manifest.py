@@ -63,14 +63,16 @@ class Manifest:
 
 
 @cache
-def code_digest() -> str:
-    """Short digest of the source files that decide results: equal code gives equal rows.
+def code_digest(package: Path = PACKAGE) -> str:
+    """Short digest of the files of ``package`` that decide results: equal code gives equal rows.
 
     A commit that changes documents, pages or commands only does not change it.
     """
     digest = hashlib.sha256()
-    for path in sorted(PACKAGE.rglob("*.py")):
-        name = path.relative_to(PACKAGE).as_posix()
+    for path in sorted(package.rglob("*")):
+        name = path.relative_to(package).as_posix()
+        if path.suffix not in (".py", ".urdf"):
+            continue
         if name.split("/")[0] not in NOT_DECIDING or name in DECIDING:
             digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:12]

@@ -1,6 +1,6 @@
 """Workers on this machine: processes of their own, so that nothing that happens to one of them ends the run.
 
-They start in 0.3 s, where Ray's own local start takes 8 s: hence two kinds of pools.
+A local Ray takes 10 s to start, processes 0.3 s: hence two kinds of pools.
 """
 
 from __future__ import annotations

@@ -59,10 +59,11 @@ def read_results(folder: Path) -> Results:
     Raises `DatasetError` for damaged files.
     """
     path = folder / RESULTS_FILE
-    if not path.exists():
-        return _read_exports(folder)
-    with _explained(path), closing(_connect(path, "rw")) as database:
-        return _read(database)
+    if path.exists():
+        with _explained(path), closing(_connect(path, "rw")) as database:
+            if _EPISODES.columns(database):  # else it was killed before it took the exports
+                return _read(database)
+    return _read_exports(folder)
 
 
 def export_results(folder: Path) -> None:
@@ -83,17 +84,18 @@ class ResultsStore:
         self.folder = folder
         self.path = folder / RESULTS_FILE
         make_folder(folder)
-        old = Results() if self.path.exists() else _read_exports(folder)
         with _explained(self.path):
             self._database = _connect(self.path, "rwc")
             with self._transaction():
+                is_new = not _EPISODES.columns(self._database)
                 for table in (_EPISODES, _FAILURES, _INVOCATIONS):
                     table.create(self._database)
                 self._database.execute(
                     "CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, content TEXT NOT NULL, "
                     "PRIMARY KEY (name, objects, assets))"
                 )
-                self._take(old)
+                if is_new:
+                    self._take(_read_exports(folder))
 
     def close(self) -> None:
         self._database.close()
@@ -179,7 +181,7 @@ class _Table:
     def create(self, database: sqlite3.Connection) -> None:
         """Make the table, or add the columns that came after an older version made it."""
         columns = {column: _SQL_TYPES[hint] for column, (hint, _) in self._hints.items()}
-        known = self._known(database)
+        known = self.columns(database)
         if not known:
             database.execute(f"CREATE TABLE {self._name} ({', '.join(map(' '.join, columns.items()))})")
         elif known != set(columns):
@@ -192,14 +194,15 @@ class _Table:
         key = ", ".join(f"IFNULL({column}, '')" if self._hints[column][1] else column for column in self._key)
         database.execute(f"CREATE UNIQUE INDEX IF NOT EXISTS {self._name}_key ON {self._name} ({key})")
 
-    def _known(self, database: sqlite3.Connection) -> set[str]:
+    def columns(self, database: sqlite3.Connection) -> set[str]:
+        """Those in the file; none where the table is not there."""
         return {row[1] for row in database.execute(f"PRAGMA table_info({self._name})")}
 
     def insert(self, database: sqlite3.Connection, row: Any) -> None:
         database.execute(self._insert, _flat(row))
 
     def read(self, database: sqlite3.Connection) -> Iterator[Any]:
-        known = sorted(self._known(database))
+        known = sorted(self.columns(database))
         self._check(set(known))
         for values in database.execute(f"SELECT {', '.join(known)} FROM {self._name} ORDER BY rowid"):
             yield self._row(self._defaults | dict(zip(known, values, strict=True)))
