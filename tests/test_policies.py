@@ -159,7 +159,7 @@ def test_confidence_falls_with_agreement_and_with_recognition():
     assert plan_confidence(Evidence(0.95, hidden)) == sure
 
 
-def test_old_names_still_work_with_a_warning(context, scene):
+def test_old_names_still_work_with_a_warning():
     import robust_instant_policy.policies as policies
 
     with pytest.warns(DeprecationWarning, match="Settings"):
