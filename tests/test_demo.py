@@ -1,5 +1,7 @@
 """The main job, small: real simulator, real image, real language model."""
 
+from pathlib import Path
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -64,7 +66,8 @@ def test_an_evaluation_goes_on_where_it_stopped_and_replays_without_a_model(run_
     assert ": failed" not in told
     assert pq.read_table("runs/eval/episodes.parquet").to_pylist() == rows
 
-    (workbench / "runs/eval/episodes.parquet").unlink()
+    for file in (*Path("runs/eval").glob("results.sqlite*"), *Path("runs/eval").glob("*.parquet")):
+        file.unlink()
     assert main([*command, "--episodes", "1", "--out", "runs/eval", "--replay"]) == 0
     replayed = pq.read_table("runs/eval/episodes.parquet").to_pylist()
     for row in (*rows, *replayed):
