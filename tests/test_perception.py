@@ -5,11 +5,10 @@ import pytest
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError
-from robust_instant_policy.geometry import invert_pose, make_pose, transform_points
+from robust_instant_policy.geometry import invert_pose, make_pose, rotations_about_vertical, transform_points
 from robust_instant_policy.perception import PAPER_SIMULATION, KeypointExtractor, measure
 from robust_instant_policy.perception.depth import in_metres, surface_depth
 from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors
-from robust_instant_policy.perception.registration import turns_about_vertical
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 from tests.pages import Page
@@ -28,7 +27,7 @@ class Scene:
         focal = size / 0.8
         middle = (size - 1) / 2
         intrinsics = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
-        pose = make_pose(turns_about_vertical(np.array(np.deg2rad(yaw))), [x, y, 0])
+        pose = make_pose(rotations_about_vertical(np.array(np.deg2rad(yaw))), [x, y, 0])
         rows, cols = np.indices((size, size))
         rays = np.stack([(cols - middle) / focal, -(rows - middle) / focal, np.zeros((size, size))], axis=-1)
         local = transform_points(invert_pose(pose), rays * (CAMERA_HEIGHT - OBJECT_HEIGHT))
