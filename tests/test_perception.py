@@ -5,22 +5,12 @@ import pytest
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError
-from robust_instant_policy.geometry import (
-    GripperTriangle,
-    invert_pose,
-    make_pose,
-    rotations_about_vertical,
-    transform_points,
-)
-from robust_instant_policy.perception import PAPER_SIMULATION, KeypointExtractor, Located, measure
+from robust_instant_policy.geometry import invert_pose, make_pose, rotations_about_vertical, transform_points
+from robust_instant_policy.perception import PAPER_SIMULATION, KeypointExtractor, measure
 from robust_instant_policy.perception.depth import in_metres, surface_depth
 from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors
-from robust_instant_policy.policies.instant import Proposal
-from robust_instant_policy.policies.policy import Usage
-from robust_instant_policy.policies.rip import robust_plan
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.tasks.camera_noise import CameraNoise
-from robust_instant_policy.trajectory import Trajectory
 from tests.pages import Page
 
 CAMERA_HEIGHT = 1.0
@@ -80,21 +70,6 @@ def test_a_camera_pose_that_is_transposed_or_in_millimetres_is_refused_and_image
     kept = Observation(rgb, depth, intrinsics, pose)
     rgb[:] = 7  # the camera's next image
     assert kept.rgb.max() == 0
-
-
-def test_a_scene_that_was_hardly_recognised_lowers_the_plans_confidence():
-    path = Trajectory.from_poses(
-        np.stack([make_pose(np.eye(3), [0, 0, height]) for height in np.linspace(0, 0.1, 9)]),
-        np.zeros(9),
-        GripperTriangle(0.1, 0.08),
-    )
-    told = []
-    for confidence in (0.8, 0.27):
-        located = Located(np.zeros((10, 3)), np.zeros((10, 2)), np.full(10, confidence))
-        told.append(robust_plan(Proposal(located, (path,) * 5, Usage(), ())))
-    assert told[0].confidence > 0.9 > 0.6 > told[1].confidence
-    assert "hardly recognised" in told[1].notes[-1]
-    assert told[0].notes == ()
 
 
 def test_keypoints_lie_on_the_object_and_are_found_again_when_it_is_turned(extractor, demonstrations):

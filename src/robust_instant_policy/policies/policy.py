@@ -1,4 +1,4 @@
-"""What a policy is and what it hands over: the protocol, and the `Plan`."""
+"""The protocol of a policy, and its `Plan`."""
 
 from __future__ import annotations
 
@@ -29,15 +29,14 @@ Progress = Callable[[str, int, int], None]
 
 
 def no_progress(stage: str, done: int, total: int) -> None:
-    """The `Progress` of a caller who does not look."""
+    """The `Progress` of a caller who wants none."""
 
 
 @dataclass(frozen=True)
 class Stage:
     """What one stage of planning cost: wall seconds, and tokens where a language model was asked.
 
-    ``prompt_tokens`` counts what the model was given, ``cached_tokens`` the part of it that it had read before,
-    ``completion_tokens`` what it wrote.
+    ``cached_tokens`` is the part of ``prompt_tokens`` that the server had in its prefix cache.
     """
 
     name: str
@@ -59,7 +58,7 @@ class Usage:
 
     @property
     def tokens(self) -> int:
-        """Tokens the model had to read and write: what it had read before is not counted again."""
+        """Tokens read and written, without cached ones."""
         return sum(stage.prompt_tokens - stage.cached_tokens + stage.completion_tokens for stage in self.stages)
 
 
@@ -80,12 +79,15 @@ class Stopwatch:
 class Plan:
     """A trajectory to execute, and why to trust it.
 
-    ``trajectory`` has T steps; ``candidates`` are the Q trajectories it was made from; ``weights (Q, T)`` in
-    [0, 1] says how much each counted at each step (low = ignored); ``scale (T, 10·A)`` is the spread of the
-    agreement in metres; ``hallucinated (Q,)`` bool names the candidates that left it, ``onset (Q,)`` the first
-    step at which each did (-1: never) and ``scores (Q,)`` how far; ``confidence`` in [0, 1] is the number to
-    gate on, None from a method that has none. ``keypoints (K, 3)``, ``pixels (K, 2)`` and
-    ``keypoint_confidence (K,)`` are what was seen; ``notes`` are remarks for the user, one line each.
+    ``trajectory`` has T steps for A arms; ``candidates`` are the Q trajectories it was made from.
+    ``weights (Q, T)`` in [0, 1] says how much each counted at each step of the plan (low = ignored).
+    ``scale (T, 10·A)`` is the spread of the agreement: in metres for the nine coordinates of an arm's points, and for
+    its gripper state, the tenth column, the weighted share of candidates with the other state, in [0, 1].
+    ``hallucinated (Q,)`` names the candidates that leave the agreement, ``onset (Q,)`` the first step, of the
+    candidate's own, at which each does (-1: never), and ``scores (Q,)`` how strong the evidence is.
+    ``confidence`` in [0, 1] is the number to gate on, None from a method that has none.
+    ``keypoints (K, 3)``, metres, world, ``pixels (K, 2)`` (u, v) and ``keypoint_confidence (K,)`` in [0, 1] are what
+    was recognised; ``notes`` are for the user, one line each.
     """
 
     trajectory: Trajectory
@@ -200,10 +202,11 @@ def _from_json(content: dict[str, list]) -> Trajectory:
 class Policy(Protocol):
     """Sees demonstrations once, then plans for new observations."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> Policy:
-        """Take in the demonstrations; returns itself."""
+        """Returns itself."""
         ...
 
     def plan(self, observation: Observation) -> Plan:
@@ -217,7 +220,7 @@ class Policy(Protocol):
 
 @runtime_checkable
 class ClosedLoopPolicy(Protocol):
-    """Sees demonstrations once, then moves the robot itself, looking again as it goes."""
+    """Sees demonstrations once, then moves the robot in closed loop."""
 
     name: str
 
@@ -227,9 +230,9 @@ class ClosedLoopPolicy(Protocol):
         ...
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> ClosedLoopPolicy:
-        """Take in the demonstrations; returns itself."""
+        """Returns itself."""
         ...
 
     def controller(self, observation: Observation) -> Controller:
-        """What moves the robot in the scene of ``observation``, from its start; good for one episode."""
+        """The controller of one episode in the scene of ``observation``."""
         ...

@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from robust_instant_policy.evaluation import paper
-from robust_instant_policy.evaluation.summary import Summary
+from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.evaluation.variant import Scene, Variant, by_demos, labels, values
 from robust_instant_policy.policies import Plan
 

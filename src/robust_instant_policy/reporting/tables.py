@@ -11,8 +11,7 @@ from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import STAGES, Failure
 from robust_instant_policy.evaluation.manifest import Invocation
-from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test
-from robust_instant_policy.evaluation.summary import Rate, Summary, reference
+from robust_instant_policy.evaluation.statistics import Rate, Summary, mark, paired_test, reference, t_test
 from robust_instant_policy.evaluation.variant import Variant, by_demos, labels, values
 from robust_instant_policy.policies import METHOD_NAMES
 

@@ -17,10 +17,11 @@ from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.waypoints import plan_onward, plan_poses, plan_waypoints
 from robust_instant_policy.tasks.demonstrator import Stroke, perform
 from robust_instant_policy.tasks.scene_truth import SceneTruth
-from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image
+from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image, bounded_seed
 from robust_instant_policy.trajectory import Trajectory
 
 HAND_STREAM = 1  # the demonstrator's random numbers, apart from the scene's
+SEED_BITS = 32  # that the simulators take
 SETTLE_SECONDS = 0.5  # at rest before a demonstration is judged
 
 Expert = Callable[[Any, np.random.Generator], Sequence[Stroke]]
@@ -160,7 +161,7 @@ class SimulatedTask:
         self._cell.close()
 
     def _rebuild(self, seed: int) -> None:
-        self._cell.reset(seed=seed)
+        self._cell.reset(seed=bounded_seed(seed, SEED_BITS))
         self._seed, self._fresh = seed, True
 
     def _recorded(self, poses: FloatArray, every: int) -> range:
