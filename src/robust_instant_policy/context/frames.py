@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from robust_instant_policy.geometry import FloatArray, fit_rigid, invert_pose, make_pose, transform_points
+from robust_instant_policy.geometry import FloatArray, fit_rigid, fit_upright, invert_pose, make_pose, transform_points
 
 RIGID_SPREAD_M = 0.010  # keypoints whose distance varies less than this belong to the same object
 DEMOS_TO_TELL_OBJECTS = 3  # with fewer, all distances look constant
@@ -103,7 +103,7 @@ def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArr
     The best of all minimal subsets, refined by iteratively reweighted least squares.
     """
     size = 2 if upright else 3
-    fit = _fit_upright if upright else fit_rigid
+    fit = fit_upright if upright else fit_rigid
     if len(shape) > size:
         subsets = np.array(list(combinations(range(len(shape)), size)))
         starts = fit(shape[subsets], points[subsets], np.ones(subsets.shape))
@@ -137,21 +137,6 @@ def _turned(angle: FloatArray) -> FloatArray:
 
 def _moved(poses: FloatArray, points: FloatArray) -> FloatArray:
     return points @ np.swapaxes(poses[..., :3, :3], -1, -2) + poses[..., None, :3, 3]
-
-
-def _fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
-    """Weighted least-squares pose that turns about the vertical only; batched like `fit_rigid`."""
-    # Not `geometry.fit_upright`: its last bits differ, which changes rounded numbers in prompts of two demonstrations,
-    # and stored samples are keyed by the prompt.
-    share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
-    source_mean = (share * source).sum(axis=-2, keepdims=True)
-    target_mean = (share * target).sum(axis=-2, keepdims=True)
-    a, b = source - source_mean, target - target_mean
-    sine = (share[..., 0] * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])).sum(axis=-1)
-    cosine = (share[..., 0] * (a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1])).sum(axis=-1)
-    pose = _turned(np.arctan2(sine, cosine))
-    pose[..., :3, 3] = target_mean[..., 0, :] - (pose[..., :3, :3] @ np.swapaxes(source_mean, -1, -2))[..., 0]
-    return pose
 
 
 def candidate_frames(keypoints: FloatArray) -> list[Frame]:
