@@ -13,8 +13,9 @@ ROOT = Path(robust_instant_policy.__file__).parent
 PACKAGE = "robust_instant_policy"
 FLOORS = {
     "errors": 1, "geometry": 1, "trajectory": 1, "demonstration": 1, "query": 1, "files": 1,
-    "controller": 1,
+    "controller": 1, "pointcloud": 1,
     "perception": 2, "context": 2, "llm": 2, "regression": 2, "datasets": 2,
+    "sanity": 2,
     "policies": 3, "tasks": 3,
     "evaluation": 4,
     "cli": 5, "report": 5, "demo": 5, "doctor": 5, "console": 5, "evaluate": 5, "train": 5, "keypoints": 5,

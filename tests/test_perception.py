@@ -8,9 +8,10 @@ from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError
 from robust_instant_policy.geometry import GripperTriangle, invert_pose, make_pose, transform_points
 from robust_instant_policy.perception import PAPER_SIMULATION, KeypointExtractor, Located, keypoints_page, measure
-from robust_instant_policy.perception.depth import in_metres, surface_depth
+from robust_instant_policy.perception.depth import surface_depth
 from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors, load_network
 from robust_instant_policy.perception.registration import turns_about_vertical
+from robust_instant_policy.pointcloud import in_metres
 from robust_instant_policy.policies.instant import Proposal
 from robust_instant_policy.policies.policy import Usage
 from robust_instant_policy.policies.rip import robust_plan
