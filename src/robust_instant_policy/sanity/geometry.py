@@ -1,0 +1,152 @@
+"""Whether images, cameras and gripper paths of a set of demonstrations belong together, and if not, why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from robust_instant_policy.demonstration import Demonstration
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.sanity.consistency import (
+    MIN_DEMONSTRATIONS,
+    Consistency,
+    consistency,
+    surroundings,
+)
+from robust_instant_policy.sanity.contact import Contact, Path, contact
+from robust_instant_policy.sanity.hypotheses import ALL, Hypothesis
+from robust_instant_policy.sanity.view import View
+
+TOUCH_M = 0.015  # gap below which a path, or a closing gripper, touches a surface
+BELOW_TABLE_M = 0.015  # that a fingertip may lie below the table's plane: fingers press on tables
+BURIED_M = 0.03  # that a palm may lie behind a surface of the start image
+MIN_SHARE = 0.5  # of the demonstrations that must agree with their images
+BETTER = 0.6  # by which the sum of the shares of a hypothesis must exceed that of the data as they are
+CONSISTENT = 0.45  # score from which surroundings repeat; the shipped tasks have 0.52 to 0.98
+COARSE_PX = 80  # grid on which hypotheses are compared
+TESTED = 8  # demonstrations on which hypotheses are compared
+PAIRINGS = 6  # wrong pairings of images and paths that the right one is compared with
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """How well paths and images fit, as shares of the demonstrations (0 to 1).
+
+    ``touching``: the path meets a raised surface; ``grasping``: so does the gripper where it closes (share of all
+    closings); ``clear``: no fingertip is below the table and no palm inside a surface; ``level``: the camera is above
+    the table and the readings lie on one plane; ``consistency`` as in `Consistency`, 0 where it is unknown.
+    """
+
+    contacts: tuple[Contact, ...]
+    surroundings: Consistency
+    touching: float
+    grasping: float
+    clear: float
+    level: float
+
+    @property
+    def total(self) -> float:
+        repeated = self.surroundings.score
+        return self.touching + self.grasping + self.clear + self.level + (repeated if np.isfinite(repeated) else 0.0)
+
+    @property
+    def path_gap(self) -> float:
+        """Median over the demonstrations, metres."""
+        return float(np.median([c.path for c in self.contacts]))
+
+    @property
+    def grasp_gap(self) -> float:
+        """Median over all closings, metres; NaN where no gripper closes."""
+        every = np.concatenate([c.grasps for c in self.contacts])
+        return float(np.median(every)) if len(every) else float("nan")
+
+    @property
+    def lowest(self) -> float:
+        """Median over the demonstrations of the lowest fingertip's height above the table, metres."""
+        return float(np.median([c.lowest for c in self.contacts]))
+
+
+def fits(contact: Contact, noise: float) -> bool:
+    """Whether a path stays above the table and outside of what the image shows."""
+    return contact.lowest > -(BELOW_TABLE_M + 2 * noise) and contact.buried < BURIED_M
+
+
+def evidence(views: Sequence[View], paths: Sequence[Path], poses: Sequence[FloatArray]) -> Evidence:
+    """Of ``views``, and the `Path` and tool poses that belong to each."""
+    contacts = tuple(contact(view, path) for view, path in zip(views, paths, strict=True))
+    closings = np.concatenate([c.grasps for c in contacts])
+    # A path that meets only what is flat on the table still meets a surface where a gripper closes on it.
+    return Evidence(
+        contacts=contacts,
+        surroundings=consistency([surroundings(view, pose) for view, pose in zip(views, poses, strict=True)]),
+        touching=float(np.mean([c.path < TOUCH_M for c in contacts])),
+        grasping=float((closings < TOUCH_M).mean()) if len(closings) else 0.0,
+        clear=float(np.mean([fits(c, view.noise) for c, view in zip(contacts, views, strict=True)])),
+        level=float(np.mean([view.share_on_plane * (view.camera_height > 0) for view in views])),
+    )
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A hypothesis that fits, and the evidence with its correction applied."""
+
+    cause: str
+    remedy: str
+    evidence: Evidence
+
+
+def explain(
+    demonstrations: Sequence[Demonstration], paths: Sequence[Path], poses: Sequence[FloatArray]
+) -> Explanation | None:
+    """The hypothesis under which images and paths fit best, if clearly better than as they are."""
+    chosen = np.unique(np.round(np.linspace(0, len(demonstrations) - 1, TESTED)).astype(np.intp))
+    some = [demonstrations[i].observation for i in chosen]
+    own_paths, own_poses = [paths[i] for i in chosen], [poses[i] for i in chosen]
+
+    def under(hypothesis: Hypothesis | None) -> Evidence:
+        views = [View.of(hypothesis.correct(o) if hypothesis else o, COARSE_PX) for o in some]
+        return evidence(views, own_paths, own_poses)
+
+    today = under(None)
+    found = [Explanation(h.cause, h.remedy, under(h)) for h in ALL]
+    found += _other_pairing([View.of(o, COARSE_PX) for o in some], own_paths, own_poses)
+    best = max(found, key=lambda e: e.evidence.total)
+    clear = best.evidence.touching >= 0.7 or best.evidence.grasping >= 0.7
+    return best if clear and best.evidence.total > today.total + BETTER else None
+
+
+def _other_pairing(views: Sequence[View], paths: Sequence[Path], poses: Sequence[FloatArray]) -> list[Explanation]:
+    """The assignment of images to paths with the smallest gaps, where it is not the given one."""
+    if len(views) < MIN_DEMONSTRATIONS:
+        return []
+    costs = np.array([[_gap(contact(view, path)) for view in views] for path in paths])
+    _, order = linear_sum_assignment(costs)
+    moved = int((order != np.arange(len(order))).sum())
+    if moved < len(order) / 2:
+        return []
+    return [
+        Explanation(
+            f"other images ({moved} of {len(order)} paths exchanged)",
+            "the trajectories are shuffled against the images: pair each with the image of its own episode",
+            evidence([views[i] for i in order], paths, poses),
+        )
+    ]
+
+
+def _gap(found: Contact) -> float:
+    return found.path + float(found.grasps.sum()) + max(-found.lowest, 0.0)
+
+
+def pairing_scores(views: Sequence[View], poses: Sequence[FloatArray]) -> tuple[float, float]:
+    """Consistency of images with their own paths, and the mean over cyclic wrong pairings."""
+    count = len(views)
+    own = consistency([surroundings(v, p) for v, p in zip(views, poses, strict=True)]).score
+    shifts = np.unique(np.round(np.linspace(1, count - 1, PAIRINGS)).astype(int)) if count > 1 else []
+    wrong = [
+        consistency([surroundings(views[(i + shift) % count], pose) for i, pose in enumerate(poses)]).score
+        for shift in shifts
+    ]
+    return own, float(np.mean(wrong)) if wrong else float("nan")

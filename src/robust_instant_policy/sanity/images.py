@@ -1,0 +1,212 @@
+"""The images of a set of demonstrations against its paths, and against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from robust_instant_policy.demonstration import Demonstration
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.sanity.agreement import CLEARLY, Agreement
+from robust_instant_policy.sanity.consistency import MIN_DEMONSTRATIONS
+from robust_instant_policy.sanity.contact import Path
+from robust_instant_policy.sanity.envelope import approaches
+from robust_instant_policy.sanity.finding import Finding
+from robust_instant_policy.sanity.geometry import (
+    CONSISTENT,
+    MIN_SHARE,
+    TOUCH_M,
+    Evidence,
+    Explanation,
+    explain,
+    fits,
+    pairing_scores,
+)
+from robust_instant_policy.sanity.hypotheses import reordered_quaternions
+from robust_instant_policy.sanity.image import check_image
+from robust_instant_policy.sanity.view import View
+
+PAIRED = 0.12  # by which the own images' consistency must exceed that of other images
+ONE_SCENE_M = 0.01  # spread of the objects below which all demonstrations show one scene
+UNLIKE = 0.25  # likeness below which a demonstration contradicts the others,
+ALIKE = 0.6  # where their median is at least this
+FAR_FROM_ALL_M = 0.04  # gap of a path that alone touches nothing
+STRAIGHT_RAD, CROOKED_RAD = np.deg2rad(1.0), np.deg2rad(5.0)  # spread of the approach with quaternions in order, or not
+
+
+def check_each_image(views: Sequence[View]) -> list[Finding]:
+    """`check_image` of every view, the same finding told once."""
+    told: dict[tuple[str, str], list[tuple[int, Finding]]] = {}
+    for index, view in enumerate(views):
+        for finding in check_image(view):
+            told.setdefault((finding.kind, finding.severity), []).append((index, finding))
+    result = []
+    for (kind, severity), cases in told.items():
+        index, first = cases[0]
+        where = "all demonstrations" if len(cases) == len(views) else f"{len(cases)} of {len(views)} demonstrations"
+        where = f"demonstration {index}" if len(cases) == 1 else f"{where}, such as {index}"
+        result.append(Finding(kind, severity, f"{where}: {first.message}", first.numbers, first.cause))
+    return result
+
+
+def check_contact(
+    demonstrations: Sequence[Demonstration],
+    views: Sequence[View],
+    paths: Sequence[Path],
+    poses: Sequence[FloatArray],
+    today: Evidence,
+) -> list[Finding]:
+    """Whether the paths meet what their images show; if not, why."""
+    count, score = len(views), today.surroundings.score
+    if not any(view.raised.any() for view in views):
+        words = "nothing in the images stands above the table: whether images and paths belong together was not checked"
+        return [Finding("contact", "unchecked", words)]
+    touches = today.touching >= MIN_SHARE or today.grasping >= MIN_SHARE
+    repeats = not np.isfinite(score) or score >= CONSISTENT
+    if today.clear >= MIN_SHARE and touches and repeats and today.level > 0:
+        return _outliers(views, today)
+    numbers = {
+        "path_gap": today.path_gap,
+        "grasp_gap": today.grasp_gap,
+        "lowest": today.lowest,
+        "consistency": score,
+        "touching": today.touching,
+        "clear": today.clear,
+    }
+    if explanation := explain(demonstrations, paths, poses):
+        words = f"{_measured(today)}; {_explained(explanation)}"
+        return [Finding("contact", "error", words, numbers, explanation.cause)]
+    if today.clear < MIN_SHARE:
+        advice = "; check the camera's pose, the depth unit and the tool's offset"
+        return [Finding("contact", "error", _measured(today) + advice, numbers)]
+    if not touches:
+        closes = any(len(c.grasps) for c in today.contacts)
+        advice = "; check the camera's pose, the tool's offset and which image belongs to which path"
+        words = _measured(today) + (advice if closes else "; nothing closes there, so it was not checked further")
+        return [Finding("contact", "error" if closes else "warning", words, numbers)]
+    own, other = pairing_scores(views, poses)
+    numbers |= {"own_images": own, "other_images": other}
+    if count > MIN_DEMONSTRATIONS and own < other + PAIRED and scene_spread(views) > ONE_SCENE_M:
+        words = f"the paths fit their own images no better than each other's ({own:.2f} against {other:.2f} of 1)"
+        advice = "; trajectories are shuffled against images, or the images are mirrored, or of another camera"
+        return [Finding("contact", "error", words + advice, numbers, "other images")]
+    words = f"what the images show around the gripper hardly repeats across the demonstrations ({score:.2f} of 1)"
+    return [Finding("contact", "unchecked", f"{words}: whether the camera is right was not decided", numbers)]
+
+
+def _measured(today: Evidence) -> str:
+    """What is wrong with the evidence, worst first."""
+    if today.lowest < -TOUCH_M:
+        return f"fingertips reach {-today.lowest * 1e3:.0f} mm below the table that the images show"
+    if today.clear < MIN_SHARE:
+        buried = float(np.median([c.buried for c in today.contacts]))
+        return f"the palm passes {buried * 1e3:.0f} mm deep through what the images show"
+    if today.touching < MIN_SHARE:
+        if np.isfinite(today.grasp_gap) and today.grasp_gap > TOUCH_M:
+            return f"grasp points lie {today.grasp_gap:.2f} m from any surface, and no path comes nearer than {today.path_gap:.2f} m"
+        return f"paths come no nearer than {today.path_gap:.2f} m to any surface"
+    score = today.surroundings.score
+    if np.isfinite(score) and score < CONSISTENT:
+        return f"what the images show around the gripper does not repeat across the demonstrations ({score:.2f} of 1)"
+    return "the camera lies below the table that it sees"
+
+
+def _explained(explanation: Explanation) -> str:
+    found = explanation.evidence
+    count = len(found.contacts)
+    near = sum(c.path < TOUCH_M for c in found.contacts)
+    words = f"with {explanation.cause} {near} of {count} come within {TOUCH_M * 1e3:.0f} mm"
+    if np.isfinite(found.surroundings.score):
+        words += f" and repeat by {found.surroundings.score:.2f}"
+    return f"{words}: {explanation.remedy}"
+
+
+def _outliers(views: Sequence[View], today: Evidence) -> list[Finding]:
+    """Single demonstrations whose path does not fit their image while the others' do."""
+    if len(views) < MIN_DEMONSTRATIONS + 1:
+        return []
+    likeness = today.surroundings.likeness
+    usual = float(np.median(likeness))
+    found = []
+    for index, (c, view) in enumerate(zip(today.contacts, views, strict=True)):
+        unlike = usual >= ALIKE and likeness[index] < UNLIKE
+        apart = c.path > FAR_FROM_ALL_M and today.touching > 1 - MIN_SHARE
+        if not (unlike or apart or not fits(c, view.noise)):
+            continue
+        words = (
+            f"demonstration {index} contradicts the others: its path comes within {c.path * 1e3:.0f} mm of a surface, "
+            f"its lowest fingertip is {c.lowest * 1e3:.0f} mm above the table, and it is {likeness[index]:.2f} like "
+            f"the others ({usual:.2f}); look at it, and remove it if it is wrong"
+        )
+        severity = "error" if apart or not fits(c, view.noise) else "warning"
+        numbers = {"demonstration": float(index), "path_gap": c.path, "likeness": float(likeness[index])}
+        found.append(Finding("contradiction", severity, words, numbers, f"demonstration {index}"))
+    return found
+
+
+def check_quaternions(demonstrations: Sequence[Demonstration]) -> list[Finding]:
+    """Grippers that lean to all sides, and would all approach in one direction with quaternions in the other order."""
+    directions = [approaches(d.trajectory).reshape(-1, 3) for d in demonstrations]
+    now = _spread(np.concatenate(directions))
+    if now < CROOKED_RAD:
+        return []
+    # one order for all arms: the triangle is the same
+    triplets = np.concatenate([d.trajectory.triplets.reshape(-1, 3, 3) for d in demonstrations])
+    for words, other in reordered_quaternions(triplets):
+        forward = other[:, 1:].mean(axis=1) - other[:, 0]
+        if (then := _spread(forward / np.linalg.norm(forward, axis=1, keepdims=True))) < STRAIGHT_RAD:
+            message = (
+                f"grippers lean by {np.rad2deg(now):.0f} degrees from their mean approach; with {words} all approach "
+                f"within {np.rad2deg(then):.1f} degrees: check the order of the quaternion's numbers"
+            )
+            return [Finding("rotation", "error", message, {"spread": now, "spread_reordered": then}, words)]
+    return []
+
+
+def _spread(directions: FloatArray) -> float:
+    """90th percentile of the angle to the mean direction, rad."""
+    mean = directions.mean(axis=0)
+    mean /= max(float(np.linalg.norm(mean)), 1e-9)
+    return float(np.percentile(np.arccos(np.clip(directions @ mean, -1, 1)), 90))
+
+
+def check_agreement(found: Sequence[Agreement]) -> list[Finding]:
+    """Whether colour and depth of the demonstrations show the same scenes."""
+    ratios = np.array([one.ratio for one in found])
+    if not np.isfinite(ratios).any():
+        return []
+    usual = float(np.nanmedian(ratios))
+    numbers = {"edges": usual}
+    if usual >= CLEARLY:
+        low = [i for i, one in enumerate(found) if one.ratio < 1 + (usual - 1) / 4]
+        words = f"colour and depth of demonstration {low[0]} show different scenes" if low else ""
+        return [Finding("colour and depth", "warning", words, numbers)] if low else []
+    causes = [one.cause for one in found if one.cause]
+    kinds = [cause.split(" (")[0] for cause in causes]
+    if (
+        causes
+        and len(causes) >= MIN_SHARE * len(found)
+        and kinds.count(max(set(kinds), key=kinds.count)) >= MIN_SHARE * len(found)
+    ):
+        cause = causes[kinds.index(max(set(kinds), key=kinds.count))]
+        words = f"edges of depth are no edges of colour ({usual:.1f} times chance); with {cause} they are"
+        return [Finding("colour and depth", "error", words, numbers, f"colour and depth: {cause}")]
+    words = f"edges of depth are no edges of colour ({usual:.1f} times chance)"
+    advice = ": colour and depth are of different scenes or streams, or the objects look like the table"
+    return [Finding("colour and depth", "warning", words + advice, numbers, "colour and depth of different scenes")]
+
+
+def object_centre(view: View) -> FloatArray:
+    """Mean ``(3,)`` of the raised points, metres; NaN where there are none."""
+    points = view.points[view.raised & np.isfinite(view.depth)]
+    return points.mean(axis=0) if len(points) else np.full(3, np.nan)
+
+
+def scene_spread(views: Sequence[View]) -> float:
+    """Root mean square distance of what is raised from its mean over the scenes, metres; NaN where unknown."""
+    centres = np.array([object_centre(view) for view in views])
+    centres = centres[np.isfinite(centres).all(axis=1)]
+    if len(centres) < 2:
+        return float("nan")
+    return float(np.sqrt(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean()))

@@ -1,0 +1,143 @@
+"""A new scene against what the demonstrations' images have in common."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.sanity.finding import Finding
+from robust_instant_policy.sanity.hypotheses import OF_DEPTH, OF_POSE, TURNS
+from robust_instant_policy.sanity.scenery import CameraChange, Likeness, Scenery, camera_change
+from robust_instant_policy.sanity.view import View
+
+SAME_PICTURE = 0.9  # share of the scenery's depth that must agree, of what the demonstrations' own agree
+SAME_TEXTURE = 0.5  # of the demonstrations' own correlation
+CALIBRATION_M, CALIBRATION_RAD = 0.01, np.deg2rad(1.0)  # that a pose may change where the picture does not
+CALIBRATION_K = 0.03  # and the intrinsics, relatively
+TABLE_M, TABLE_RAD = 0.02, np.deg2rad(2.0)  # that the table may differ from the demonstrations'
+RATIO = 0.015  # relative difference of depth that is a scale, not noise
+PEAK = 0.25  # correlation from which a displaced picture is recognised
+MIN_PLANE = 0.4
+
+
+def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
+    """For demonstrations from one fixed camera: has the camera, its calibration or the picture changed since?"""
+    observation = view.observation
+    change = camera_change(scenery.reference, observation)
+    if observation.rgb.shape != scenery.reference.rgb.shape:
+        old, new = scenery.reference.rgb.shape, observation.rgb.shape
+        words = f"the image has {new[1]}x{new[0]} pixels, the demonstrations' have {old[1]}x{old[0]}"
+        return [Finding("camera", "warning", f"{words}: scenery was not compared", cause="another resolution")]
+    like = scenery.likeness(view)
+    if not np.isfinite(like.depth):
+        return [Finding("scenery", "unchecked", "too little of the scenery is visible to compare it")]
+    same_depth = like.depth >= SAME_PICTURE * scenery.agreed
+    same_texture = not scenery.textured or not like.texture < SAME_TEXTURE * scenery.texture
+    numbers = {
+        "same_depth": like.depth,
+        "texture": like.texture,
+        "moved": change.moved,
+        "turned": change.turned,
+        "intrinsics": change.intrinsics,
+    }
+    if same_depth and same_texture:
+        small = change.moved < CALIBRATION_M and change.turned < CALIBRATION_RAD and change.intrinsics < CALIBRATION_K
+        if small:
+            return []
+        cause = _name_calibration(scenery.reference, observation, change)
+        words = f"the picture is the demonstrations', but its camera is said to be {change}"
+        return [Finding("camera", "error", f"{words}: {cause}", numbers, cause)]
+    if change.same:
+        return [_picture_changed(view, scenery, like, same_depth, numbers)]
+    return []  # another camera, or one that was moved and calibrated: only the world can be compared
+
+
+def _name_calibration(old: Observation, new: Observation, change: CameraChange) -> str:
+    for hypothesis in OF_POSE:
+        if hypothesis.pose is None:
+            continue
+        corrected = replace(new, camera_pose=hypothesis.pose(new.camera_pose))
+        fixed = camera_change(old, corrected)
+        if fixed.moved < CALIBRATION_M and fixed.turned < CALIBRATION_RAD:
+            return f"{hypothesis.cause} is the demonstrations'; {hypothesis.remedy}"
+    if change.intrinsics >= CALIBRATION_K:
+        ratio = new.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] / old.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+        told = ", ".join(f"{name} x{value:.3g}" for name, value in zip(("fx", "fy", "cx", "cy"), ratio, strict=True))
+        return f"intrinsics of another camera or resolution, or a wrong focal length or principal point ({told})"
+    return "the camera pose is wrong, here or in the demonstrations; calibrate the camera once for both"
+
+
+def _picture_changed(
+    view: View, scenery: Scenery, like: Likeness, same_depth: bool, numbers: dict[str, float]
+) -> Finding:
+    """The camera is said to be the same, and the picture is not: name what restores it."""
+    for what, rows, cols in TURNS:
+        turned = scenery.likeness(view, rows, cols)
+        if (
+            scenery.textured
+            and turned.texture >= SAME_TEXTURE * scenery.texture
+            and turned.texture > like.texture + 0.2
+        ):
+            which = "the image is" if not same_depth or _symmetric(scenery, rows, cols) else "the colour image is"
+            words = f"{which} {what}: turned back, its texture agrees by {turned.texture:.2f} (now {like.texture:.2f})"
+            return Finding("scenery", "error", words, numbers, f"image {what}")
+        if not same_depth and turned.depth >= SAME_PICTURE * scenery.agreed and turned.depth > like.depth + 0.05:
+            words = f"the depth image is {what}: turned back, {turned.depth:.0%} of the scenery agree (now {like.depth:.0%})"
+            return Finding("scenery", "error", words, numbers, f"depth {what}")
+    texture_holds = scenery.textured and like.texture >= SAME_TEXTURE * scenery.texture
+    if not same_depth and (texture_holds or not scenery.textured or abs(like.ratio - 1) > 0.3):
+        numbers = {**numbers, "ratio": like.ratio, "offset": like.offset}
+        for hypothesis in OF_DEPTH:
+            fixed = scenery.likeness(View.of(hypothesis.correct(view.observation)))
+            if fixed.depth >= SAME_PICTURE * scenery.agreed:
+                words = f"depth reads {like.ratio:.3g} times the demonstrations' over the same scenery"
+                cause = hypothesis.cause
+                return Finding(
+                    "scenery", "error", f"{words}; with {cause} it agrees: {hypothesis.remedy}", numbers, cause
+                )
+        words = f"depth reads {like.ratio:.3g} times the demonstrations' ({like.offset * 100:+.1f} cm) over the same scenery"
+        advice = (
+            "; check the depth unit and calibration, and whether the camera was moved towards or away from the table"
+        )
+        return Finding("scenery", "error", words + advice, numbers, "depth scale, or camera moved")
+    if scenery.textured:
+        cols, rows, peak = scenery.shift(view)
+        if peak >= PEAK * scenery.texture and (cols or rows):
+            metres = np.hypot(cols, rows) * np.nanmedian(view.depth) / abs(view.observation.intrinsics[0, 0])
+            words = f"the camera was moved: the scenery lies {cols:+d}, {rows:+d} pixels ({metres * 100:.0f} cm) beside where it was"
+            advice = "; calibrate it anew, or put it back"
+            return Finding("scenery", "error", words + advice, {**numbers, "shift": float(metres)}, "camera moved")
+    if not same_depth:
+        words = f"{like.depth:.0%} of the scenery's depth are as in the demonstrations"
+        advice = ": the camera was moved, or the depth is of another scene or stream"
+        return Finding("scenery", "error", words + advice, numbers, "camera moved")
+    words = f"the scenery looks different from the demonstrations' (texture agrees by {like.texture:.2f}, there {scenery.texture:.2f})"
+    advice = ": the camera was moved, the colour image is of another stream, or the table is covered"
+    return Finding("scenery", "error", words + advice, numbers, "camera moved, or another colour image")
+
+
+def _symmetric(scenery: Scenery, rows: int, cols: int) -> bool:
+    """Whether the scenery's depth turned round is the same, so that depth cannot say if it was turned."""
+    both = scenery.static & scenery.static[::rows, ::cols]
+    return bool((np.abs(scenery.depth - scenery.depth[::rows, ::cols]) < 0.006)[both].mean() > SAME_PICTURE)
+
+
+def check_table(view: View, plane: FloatArray, centre: FloatArray) -> list[Finding]:
+    """The table must be where the demonstrations' table is, at their ``centre (3,)``, wherever the camera is."""
+    if view.share_on_plane < MIN_PLANE:
+        words = f"only {view.share_on_plane:.0%} of the image are one plane: the table's height was not checked"
+        return [Finding("table", "unchecked", words, {"share_on_plane": view.share_on_plane})]
+    offset = float(centre @ view.plane[:3] + view.plane[3])
+    angle = float(np.arccos(np.clip(view.plane[:3] @ plane[:3], -1, 1)))
+    if abs(offset) <= TABLE_M and angle <= TABLE_RAD:
+        return []
+    words = (
+        f"the table lies {abs(offset) * 100:.1f} cm {'below' if offset > 0 else 'above'} the demonstrations' table, "
+        f"turned by {np.rad2deg(angle):.1f} degrees"
+    )
+    numbers = {"table_offset": offset, "table_angle": angle}
+    advice = "; the camera's pose or the depth is wrong"
+    return [Finding("table", "error", words + advice, numbers, "camera pose or depth: the table moved")]
