@@ -21,10 +21,9 @@ def in_metres(image: ArrayLike) -> tuple[NDArray[np.float32], str]:
     """Depth with NaN for every missing reading, in metres, and a line that says so if it was in millimetres."""
     depth: NDArray[np.float32] = np.array(image, dtype=np.float32)
     depth[~np.isfinite(depth) | (depth <= 0)] = np.nan
-    if np.isfinite(depth).any() and np.nanmedian(depth) > MILLIMETRES_ABOVE:
-        return (depth / 1000).astype(
-            np.float32
-        ), f"depth with a median of {np.nanmedian(depth):.0f} was read as millimetres"
+    known = np.isfinite(depth)
+    if known.any() and (median := float(np.median(depth[known]))) > MILLIMETRES_ABOVE:
+        return (depth / 1000).astype(np.float32), f"depth with a median of {median:.0f} was read as millimetres"
     return depth, ""
 
 

@@ -99,6 +99,15 @@ OF_DEPTH = (
     Hypothesis("depth along the optical axis in place of along the rays", "convert ray length to depth", along_axis),
 )
 OF_IMAGES = tuple(_of_image(*turn) for turn in TURNS)
+DISPLACED = tuple(
+    _of_pose(
+        f"the camera about {abs(by) * 100:.0f} cm {'further' if by > 0 else 'back'} along the world's {'xyz'[axis]} axis",
+        "the camera's pose is off, or the tool's offset: calibrate both again",
+        lambda pose, axis=axis, by=by: make_pose(np.eye(3), by * np.eye(3)[axis]) @ pose,  # type: ignore[misc]
+    )
+    for axis in range(3)
+    for by in (-0.15, -0.1, -0.05, 0.05, 0.1, 0.15)
+)
 ALL = OF_POSE + OF_INTRINSICS + OF_DEPTH + OF_IMAGES
 
 

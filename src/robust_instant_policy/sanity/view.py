@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -44,13 +44,14 @@ class View:
     raised: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, observation: Observation, max_edge: int = MAX_EDGE_PX) -> View:
-        """The grid of ``observation``; depth in millimetres is read as such."""
+    def of(cls, observation: Observation, repaired: bool = False) -> View:
+        """The grid of ``observation``; depth in millimetres is read as such.
+
+        Flying pixels are left out, unless the image is ``repaired``, as `coarse` does.
+        """
         depth, _ = in_metres(observation.depth)
-        every = -(-max(depth.shape) // max_edge)
-        # a median over the pixels that are skipped keeps flying pixels and single holes out of the grid
-        with np.errstate(invalid="ignore"):
-            grid = np.where(steady(depth), depth, np.nan)[::every, ::every]
+        every = -(-max(depth.shape) // MAX_EDGE_PX)
+        grid = (depth if repaired else _without_flying_pixels(depth))[::every, ::every]
         rgb = observation.rgb[::every, ::every].astype(np.float32)
         rows, cols = np.mgrid[: grid.shape[0], : grid.shape[1]] * every
         points = lift(np.stack([cols, rows], axis=-1), grid, observation.intrinsics, observation.camera_pose)
@@ -109,3 +110,21 @@ class View:
         col, row = np.where(inside[:, None], cells, 0).astype(np.intp).T
         behind = np.where(inside, local[:, 2] - self.depth[row, col], np.nan)
         return behind, inside & self.raised[row, col]
+
+
+def coarse(observation: Observation, max_edge: int) -> Observation:
+    """``observation`` on a grid of at most ``max_edge`` pixels along the longer edge, flying pixels left out."""
+    every = -(-max(observation.depth.shape) // max_edge)
+    depth, _ = in_metres(observation.depth)
+    shrink = np.array([[1 / every, 1, 1 / every], [1, 1 / every, 1 / every], [1, 1, 1]])
+    return replace(
+        observation,
+        rgb=observation.rgb[::every, ::every],
+        depth=_without_flying_pixels(depth)[::every, ::every],
+        intrinsics=observation.intrinsics * shrink,
+    )
+
+
+def _without_flying_pixels(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    with np.errstate(invalid="ignore"):
+        return np.where(steady(depth), depth, np.float32("nan"))
