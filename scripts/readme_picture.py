@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from robust_instant_policy import Observation, Plan
 from robust_instant_policy.datasets.video import decode_video
 from robust_instant_policy.geometry import project
-from robust_instant_policy.report import CANDIDATE_COLOURS, HALLUCINATED_COLOUR, KEYPOINT_COLOURS
+from robust_instant_policy.reporting.run import CANDIDATE_COLOURS, HALLUCINATED_COLOUR, KEYPOINT_COLOURS
 
 HEIGHT = 360  # pixels
 EVERY = 2  # of the video's frames

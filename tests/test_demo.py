@@ -8,7 +8,7 @@ from robust_instant_policy import Plan
 from robust_instant_policy.cli import main
 from robust_instant_policy.datasets.video import decode_video
 from robust_instant_policy.geometry import GripperTriangle
-from robust_instant_policy.report import RunRecord
+from robust_instant_policy.reporting.run import RunRecord
 from tests.conftest import NUM_DEMONSTRATIONS
 
 DEMOS = str(NUM_DEMONSTRATIONS)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from robust_instant_policy.cli import _parser
+from robust_instant_policy.cli import parse
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -40,7 +40,7 @@ def test_shell_blocks_hold_commands_that_exist(page):
                 continue
             program = Path(words[0]).name
             if program == "rip":
-                _parser().parse_args(words[1:])  # exits with a message for a wrong command
+                parse(words[1:])  # exits with a message for a wrong command
             elif program == "make":
                 assert set(word for word in words[1:] if "=" not in word) <= TARGETS, line
             elif program.startswith("python"):

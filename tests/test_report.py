@@ -10,7 +10,7 @@ from robust_instant_policy.cli import main
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.geometry import GripperTriangle, make_pose
 from robust_instant_policy.policies import Stage, Usage
-from robust_instant_policy.report import PLAN_FILE, SEEN_FILE, RunRecord, save_context, write_report
+from robust_instant_policy.reporting.run import PLAN_FILE, SEEN_FILE, RunRecord, save_context, write_report
 
 QUERIES, STEPS, KEYPOINTS = 5, 12, 10
 

@@ -11,8 +11,8 @@ import pytest
 
 from robust_instant_policy.errors import UnreachableError
 from robust_instant_policy.geometry import invert_pose, lift
+from robust_instant_policy.motion.arm import Motion
 from robust_instant_policy.tasks import make_task
-from robust_instant_policy.tasks.motion import Motion
 from robust_instant_policy.trajectory import Trajectory, downsample
 
 SEED = 1

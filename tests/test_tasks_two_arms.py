@@ -74,7 +74,7 @@ def test_what_is_refused_names_the_arm(task, trajectory, arm, name):
     task.reset(SEED)
     actions = trajectory.actions.copy()
     actions[14, arm][[2, 5, 8]] -= 0.2
-    with pytest.raises(UnreachableError, match=f"step 14 .* the {name} gripper for fingers .* inside the table"):
+    with pytest.raises(UnreachableError, match=f"step 14 .* the {name} gripper for fingertips .* inside the table"):
         task.execute(Trajectory.from_actions(actions))
 
 

@@ -13,8 +13,9 @@ from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import RipError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.arm import Arm, Motion
+from robust_instant_policy.motion.waypoints import plan_onward, plan_poses, plan_waypoints
 from robust_instant_policy.tasks.demonstrator import Stroke, perform
-from robust_instant_policy.tasks.motion import Arm, Motion, plan_onward, plan_poses, plan_waypoints
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image
 from robust_instant_policy.trajectory import Trajectory

@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 
 from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pose
-from robust_instant_policy.tasks.kinematics import Kinematics
-from robust_instant_policy.tasks.motion import Arm
+from robust_instant_policy.motion.arm import Arm
+from robust_instant_policy.motion.kinematics import Kinematics
 
 MODEL_PATH = Path(gym_aloha.__file__).parent / "assets" / "bimanual_viperx_transfer_cube.xml"
 

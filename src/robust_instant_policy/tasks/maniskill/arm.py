@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.geometry import make_pose
-from robust_instant_policy.tasks.kinematics import Kinematics
+from robust_instant_policy.motion.arm import Arm
+from robust_instant_policy.motion.kinematics import Kinematics
 from robust_instant_policy.tasks.maniskill.cell import BASE_POSITION_M, HOME_JOINTS
 from robust_instant_policy.tasks.maniskill.robot import (
     ARM_JOINTS,
@@ -17,7 +18,6 @@ from robust_instant_policy.tasks.maniskill.robot import (
     TOOL_LINK,
     URDF_PATH,
 )
-from robust_instant_policy.tasks.motion import Arm
 
 EXECUTE_HZ = 5.5  # "executed at 5.5 Hz" (Oh et al. 2025, Sec. V-A)
 JOINT_SPEED_LIMIT_RAD_S = 0.8 * np.pi  # the joints' 180 degrees/s, with a margin for tracking

@@ -33,9 +33,9 @@ class Kinematics:
     """An arm whose first ``num_joints`` joints, in the order of ``model``, move the frame ``tool``.
 
     ``tool`` names a ``kind`` ("body" or "site") of the model; ``base (4, 4)`` is where the model's origin stands in
-    the world. ``orientation_cost`` says how many metres off a tool turned by a radian counts as. With a
-    ``reluctance``, in the same unit, joints rather stay where they are: close to a singular pose the tool is then
-    turned a little less than asked for, where without it a joint would swing round.
+    the world. ``orientation_cost`` says how many metres off a tool turned by a radian counts as. A
+    ``posture_cost``, in the same unit, keeps joints close to where they are: near a singular pose the tool then
+    turns a little less than asked for, where without it a joint would swing round.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Kinematics:
         kind: Literal["body", "site"],
         num_joints: int,
         base: ArrayLike,
-        reluctance: float = 0.0,
+        posture_cost: float = 0.0,
         orientation_cost: float = ORIENTATION_COST,
     ):
         self._configuration = mink.Configuration(model)
@@ -53,8 +53,8 @@ class Kinematics:
         self._task = mink.FrameTask(
             tool, kind, position_cost=1.0, orientation_cost=orientation_cost, lm_damping=LEVENBERG_MARQUARDT
         )
-        self._staying = mink.PostureTask(model, cost=reluctance)
-        self._tasks = [self._task, self._staying] if reluctance else [self._task]
+        self._posture = mink.PostureTask(model, cost=posture_cost)
+        self._tasks = [self._task, self._posture] if posture_cost else [self._task]
         self._limits = [mink.ConfigurationLimit(model)]
         self._base = np.asarray(base, dtype=np.float64)
 
@@ -72,7 +72,7 @@ class Kinematics:
         errors = np.empty((len(poses), 2))
         for step, pose in enumerate(local):
             self._task.set_target(mink.SE3.from_matrix(pose))
-            self._staying.set_target(self._configuration.q)
+            self._posture.set_target(self._configuration.q)
             errors[step] = self._solve()
             joints[step] = self._configuration.q[: self.num_joints]
         return JointPath(joints, errors[:, 0], errors[:, 1])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from robust_instant_policy.console import StageConsole
+from robust_instant_policy.commands.console import StageConsole
+from robust_instant_policy.commands.options import beside, natural, positive
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.evaluation import scene_seed
@@ -18,6 +20,21 @@ from robust_instant_policy.tasks.camera_noise import CameraNoise
 
 NOISE_SEED = 1_000_000  # of the demonstrations' camera noise, apart from the scenes'
 Camera = Callable[[Observation, int], Observation]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--demos", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--scenes", type=positive, default=20, metavar="N", help="new scenes (default: %(default)s)")
+    parser.add_argument("--seed", type=natural, default=0)
+    parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
+    parser.add_argument("--noise", action="store_true", help="with the noise of a stereo depth camera")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR-keypoints.html)")
+
+
+def run(options: argparse.Namespace) -> int:
+    out = options.out or beside(options.demos, "-keypoints.html")
+    show_keypoints(options.demos, options.features, options.scenes, options.noise, options.seed, out)
+    return 0
 
 
 def show_keypoints(demos: Path, features: str, num_scenes: int, noisy: bool, seed: int, out: Path) -> Path:

@@ -1,14 +1,16 @@
-"""The main job: show a task, draw a new scene, plan, execute, and leave a folder that explains it all."""
+"""`rip demo`: show a task, draw a new scene, plan, execute, and write a folder that explains the result."""
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robust_instant_policy.console import StageConsole
+from robust_instant_policy.commands.console import StageConsole
+from robust_instant_policy.commands.options import DATA, RUNS, add_method, method_settings, natural
 from robust_instant_policy.datasets import VideoWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import UnreachableError, UsageError
@@ -16,7 +18,7 @@ from robust_instant_policy.evaluation import obtain_demonstrations, scene_seed
 from robust_instant_policy.evaluation.episodes import holds_episodes
 from robust_instant_policy.llm import connect
 from robust_instant_policy.policies import InstantPolicy, RobustInstantPolicy
-from robust_instant_policy.report import (
+from robust_instant_policy.reporting.run import (
     PLAN_FILE,
     SEEN_FILE,
     VIDEO_FILE,
@@ -26,6 +28,23 @@ from robust_instant_policy.report import (
 )
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.task import Task
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--task", default="push-cube", help="task to show (default: %(default)s)")
+    parser.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
+    parser.add_argument("--seed", type=natural, default=0, help="which new scene (default: %(default)s)")
+    parser.add_argument("--demos", default="10", metavar="N|DIR", help="how many demonstrations, or a folder of them")
+    parser.add_argument("--out", type=Path, help="run folder (default: runs/TASK-SEED)")
+    add_method(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    if options.demos.isdecimal() and int(options.demos) == 0:
+        raise UsageError("--demos 0: show the task at least once")
+    out = options.out or RUNS / f"{options.task}-{options.seed}"
+    run_demo(options.task, options.llm, options.seed, options.demos, out, DATA, method_settings(options))
+    return 0
 
 
 def run_demo(

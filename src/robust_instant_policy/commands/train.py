@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from robust_instant_policy.console import StageConsole, TrainingScreen
+from robust_instant_policy.commands.console import StageConsole, TrainingScreen
+from robust_instant_policy.commands.options import natural, positive
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import TRAINED_METHODS, KeypointContext, make_trained_policy
-from robust_instant_policy.policies.training import Training
+from robust_instant_policy.policies.training import DEFAULT_STEPS, Training
 from robust_instant_policy.policies.training_picture import training_picture
 from robust_instant_policy.tasks import TASK_NAMES, make_task
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--task", required=True)
+    parser.add_argument("--method", required=True, metavar="METHOD", help="dp or kat-dp")
+    parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="dp needs images along the way")
+    parser.add_argument("--limit", type=positive, metavar="N", help="show it the first N of them only")
+    parser.add_argument("--steps", type=positive, metavar="N", help="of gradient descent")
+    parser.add_argument("--seed", type=natural, default=0)
+    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where there is one")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="rip eval --checkpoints DIR finds it there"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    training = Training(options.out, options.steps or DEFAULT_STEPS, options.device, options.seed)
+    train(options.task, options.method, options.demos, options.limit, training)
+    return 0
 
 
 def train(task: str, method: str, demos: Path, limit: int | None, training: Training) -> None:

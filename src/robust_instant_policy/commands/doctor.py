@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import os
 import platform
@@ -34,6 +35,20 @@ class Finding:
     works: bool
     detail: str
     remedy: str = ""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    pass
+
+
+def run(options: argparse.Namespace) -> int:
+    healthy = True
+    for finding in examine(Path.cwd()):
+        healthy &= finding.works
+        mark = "ok  " if finding.works else "FAIL"
+        advice = "" if finding.works or not finding.remedy else f"\n      → {finding.remedy}"
+        print(f"{mark}  {finding.name:<20}{finding.detail}{advice}", flush=True)
+    return 0 if healthy else 1
 
 
 def examine(folder: Path) -> Iterator[Finding]:

@@ -1,0 +1,24 @@
+"""`rip merge`: several evaluations in one folder."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from robust_instant_policy.evaluation.merging import Share, merge
+from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders that rip eval --out wrote")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder, or one to be added to")
+
+
+def run(options: argparse.Namespace) -> int:
+    def report(share: Share) -> None:
+        print(f"{share.folder}: {share.new} executions, {share.known} more known already", flush=True)
+
+    merge(options.runs, options.out, report)
+    publish(options.out)
+    print(options.out / PAGE_FILE)
+    return 0

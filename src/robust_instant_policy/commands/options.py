@@ -1,0 +1,53 @@
+"""Arguments that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+DATA = Path("data")  # where demonstrations are recorded, a folder a task
+RUNS = Path("runs")
+CHECKPOINTS = Path("checkpoints")
+
+
+def natural(text: str) -> int:
+    """A whole number from 0."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number, not {text!r}")
+    return int(text)
+
+
+def positive(text: str) -> int:
+    """A whole number from 1."""
+    if natural(text) == 0:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return int(text)
+
+
+def add_assets(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--assets", choices=("code", "maniskill"), default="code", help="objects made in code, or ManiSkill's downloads"
+    )
+
+
+def add_method(parser: argparse.ArgumentParser) -> None:
+    """The settings of the method; `method_settings` reads them."""
+    parser.add_argument("--frames", choices=("adaptive", "world"), default="adaptive")
+    parser.add_argument("--layout", choices=("factorised", "sequence"), default="factorised")
+    parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
+    parser.add_argument("--downsampling", choices=("masked", "uniform"), default="masked")
+    parser.add_argument(
+        "--deadline", type=positive, default=300, metavar="SECONDS", help="for the answers of one plan (default: 300)"
+    )
+
+
+def method_settings(options: argparse.Namespace) -> dict[str, Any]:
+    settings = {name: getattr(options, name) for name in ("frames", "layout", "features", "downsampling")}
+    return {**settings, "deadline_s": float(options.deadline)}
+
+
+def beside(folder: Path, ending: str) -> Path:
+    """The path of a page named like ``folder``, next to it."""
+    named = folder if folder.name and folder.name != ".." else folder.resolve()
+    return named.with_name(named.name + ending)

@@ -1,0 +1,44 @@
+"""`rip plan`: a plan for one observation; nothing moves."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from robust_instant_policy.commands.console import StageConsole
+from robust_instant_policy.commands.options import add_method, method_settings, positive
+from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.llm import connect
+from robust_instant_policy.policies import InstantPolicy, RobustInstantPolicy
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--demos", required=True, metavar="DIR")
+    parser.add_argument(
+        "--observation", required=True, metavar="FILE", help=".npz with rgb, depth, intrinsics, camera_pose"
+    )
+    parser.add_argument("--llm", default="embedded")
+    parser.add_argument("--queries", type=positive, default=5, metavar="Q")
+    parser.add_argument("--out", type=Path, default=Path("plan.json"), metavar="FILE")
+    add_method(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    screen = StageConsole()
+    observation = Observation.load(options.observation)
+    demonstrations = load_demonstrations(options.demos)
+    with screen.stage(f"language model ({options.llm})"):
+        model = connect(options.llm)
+    try:
+        instant = InstantPolicy(model, progress=screen.done_so_far, **method_settings(options))
+        policy = RobustInstantPolicy(instant, num_queries=options.queries)
+        with screen.stage("keypoints of the demonstrations"):
+            policy.fit(demonstrations)
+        with screen.stage("plan"):
+            plan = policy.plan(observation)
+    finally:
+        model.close()
+    plan.save(options.out)
+    screen.say(f"{options.out}: {len(plan.trajectory)} steps, confidence {plan.confidence:.2f}")
+    return 0

@@ -1,0 +1,51 @@
+"""`rip record`: demonstrations of a simulated task into a dataset folder."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from robust_instant_policy.commands.console import StageConsole
+from robust_instant_policy.commands.options import add_assets, natural, positive
+from robust_instant_policy.datasets import DatasetWriter
+from robust_instant_policy.tasks import make_task
+from robust_instant_policy.tasks.record import record
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--task", required=True)
+    parser.add_argument("--episodes", type=positive, default=10)
+    parser.add_argument("--seed", type=natural, default=0, help="where a new folder starts drawing scenes")
+    parser.add_argument("--images", action="store_true", help="keep the camera's images along the way")
+    parser.add_argument(
+        "--every", type=positive, default=1, metavar="N", help="keep every N-th step only: 5 of 55 Hz leaves 11 Hz"
+    )
+    add_assets(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+
+def run(options: argparse.Namespace) -> int:
+    screen = StageConsole()
+    task = make_task(options.task, assets=options.assets)
+    try:
+        with (
+            screen.stage(f"{options.episodes} demonstrations"),
+            DatasetWriter(
+                options.out, task=task.name, description=task.description, rate_hz=task.record_hz / options.every
+            ) as writer,
+        ):
+            thrown_away = record(
+                task,
+                writer,
+                options.episodes,
+                seed=options.seed,
+                with_images=options.images,
+                every=options.every,
+                on_progress=lambda there, count, _: screen.done_so_far("recording", there, count),
+            )
+    finally:
+        task.close()
+    screen.say(
+        f"{options.out}: {options.episodes} demonstrations of {task.name}, {thrown_away} failed attempts thrown away"
+    )
+    return 0

@@ -1,0 +1,24 @@
+"""`rip report`: the report of a run, or of an evaluation, written again from its files."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from robust_instant_policy.evaluation.episodes import holds_episodes
+from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
+from robust_instant_policy.reporting.run import write_report
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="DIR")
+
+
+def run(options: argparse.Namespace) -> int:
+    if holds_episodes(options.folder):
+        publish(options.folder)
+        print(options.folder / PAGE_FILE)
+        return 0
+
+    print(write_report(options.folder))
+    return 0

@@ -1,0 +1,1 @@
+"""Pages, tables and figures: views on what runs, datasets and evaluations wrote."""
