@@ -232,7 +232,8 @@ def quaternion_order(triplets: FloatArray) -> FloatArray:
 def tool_along_x(triplets: FloatArray) -> FloatArray:
     """A tool frame whose approach is x, taken for z."""
     triangle = GripperTriangle.from_triplets(triplets)
-    return triangle.triplets(triangle.poses(triplets) @ make_pose(Rotation.from_euler("y", 90, degrees=True).as_matrix(), (0, 0, 0)))  # fmt: skip
+    turn = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    return triangle.triplets(triangle.poses(triplets) @ make_pose(turn, (0, 0, 0)))
 
 
 def flange(triplets: FloatArray) -> FloatArray:
@@ -347,6 +348,11 @@ def spin(degrees: float) -> Callable[[FloatArray], FloatArray]:
     return change
 
 
+def about_the_fingertips(own: FloatArray) -> FloatArray:
+    """The palm below the fingertips."""
+    return 2 * own[..., 1:, :].mean(axis=-2, keepdims=True) - own
+
+
 def lower(metres: float) -> Callable[[FloatArray], FloatArray]:
     return lambda own: own - [0, 0, metres]
 
@@ -435,7 +441,7 @@ def _faults() -> dict[str, Fault]:
     add("tool-along-x:demos", ("tool", "gripper"), demonstrations=points(tool_along_x))
     add("flange:demos", ("surface", "tool", "camera"), demonstrations=points(flange))
     add("axes-swapped:demos", ("axes", "x and y"), demonstrations=points(lambda p: p[..., [1, 0, 2]]))
-    add("base-frame:demos", ("surface", "camera"), demonstrations=points(lambda p: p + [0.5, 0, 0]))
+    add("base-frame:demos", ("surface", "camera"), demonstrations=points(lambda p: p + np.array([0.5, 0, 0])))
     add("state-255:demos", ("0 or 1",), demonstrations=states(lambda g: g * 255))
     add("state-half:demos", ("0 or 1",), demonstrations=states(lambda g: g * 0.5))
     add("state-minus:demos", ("0 or 1",), demonstrations=states(lambda g: g * 2 - 1))
@@ -460,7 +466,7 @@ def _faults() -> dict[str, Fault]:
     add("never-closes:plan", ("gripper",), plan=plan_states(np.zeros_like))
     add("flutter:plan", ("gripper",), plan=plan_states(flutter))
     add("collapsed:plan", ("finger", "gripper"), plan=plan_points(lambda p: np.repeat(p[..., 1:2, :], 3, axis=-2)))
-    add("upside-down:plan", ("turn", "approach", "gripper"), plan=plan_points(lambda p: 2 * p[..., 1:, :].mean(axis=-2, keepdims=True) - p))  # fmt: skip
+    add("upside-down:plan", ("turn", "approach", "gripper"), plan=plan_points(about_the_fingertips))
     return found
 
 

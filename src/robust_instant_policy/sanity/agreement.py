@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_gradient_magnitude, maximum_filter, minimum_filter
+from scipy.optimize import linear_sum_assignment
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.hypotheses import TURNS
@@ -75,6 +77,20 @@ def agreement(view: View) -> Agreement:
     window = sums[middle[0] - reach[0] : middle[0] + reach[0] + 1, middle[1] - reach[1] : middle[1] + reach[1] + 1]
     row, col = np.unravel_index(int(window.argmax()), window.shape)
     by = np.array([col - reach[1], row - reach[0]]) * view.every
-    tried.append((float(window.max()), f"depth moved by {by[0]:+d}, {by[1]:+d} pixels (it is not aligned to colour)"))
+    tried.append(
+        (
+            float(window.max()),
+            f"depth moved by {by[0]:+d}, {by[1]:+d} pixels (it is not aligned to colour, or of another scene)",
+        )
+    )
     best, cause = max(tried)
     return Agreement(own, chance, best, cause if best > NAMED * max(own, chance) else "")
+
+
+def exchanged(views: Sequence[View]) -> tuple[int, float, float]:
+    """How many colour images fit the depth of another view better, when images are exchanged for the best fit; the
+    mean strength of edges then, and as they are."""
+    edges, colours = [depth_edges(view) for view in views], [colour_edges(view.rgb) for view in views]
+    strength = np.array([[colour[e].mean() if e.any() else 0.0 for colour in colours] for e in edges])
+    rows, order = linear_sum_assignment(-strength)
+    return int((order != rows).sum()), float(strength[rows, order].mean()), float(np.diag(strength).mean())

@@ -49,7 +49,7 @@ class Path:
     def of(cls, trajectory: Trajectory) -> Path:
         """Thin ``trajectory`` out; idle arms, which never move, touch nothing."""
         closed = trajectory.gripper_state > 0.5
-        closing = np.argwhere(closed[1:] & ~closed[:-1]) + [1, 0]
+        closing = np.argwhere(closed[1:] & ~closed[:-1]) + np.array([1, 0])
         steps = np.unique(np.round(np.linspace(0, len(trajectory) - 1, PATH_STEPS)).astype(np.intp))
         steps = np.union1d(steps, closing[:, 0])
         triplets = trajectory.triplets

@@ -46,7 +46,7 @@ def _rates(demonstrations: Sequence[Demonstration]) -> list[Finding]:
     wrong = np.flatnonzero(~(np.isfinite(rates) & (rates > 0)))
     if not len(wrong):
         return []
-    words = f"the recording rate of {_these(wrong)} is {rates[wrong[0]]:g} Hz; it must be a positive number of steps a second"
+    words = f"the recording rate of {_these(wrong)} is {rates[wrong[0]]:g} Hz; it must be positive"
     return [_error("rate", words, rate_hz=float(rates[wrong[0]]))]
 
 

@@ -101,7 +101,7 @@ OF_DEPTH = (
 OF_IMAGES = tuple(_of_image(*turn) for turn in TURNS)
 DISPLACED = tuple(
     _of_pose(
-        f"the camera about {abs(by) * 100:.0f} cm {'further' if by > 0 else 'back'} along the world's {'xyz'[axis]} axis",
+        f"the camera moved by about {by * 100:+.0f} cm along the world's {'xyz'[axis]} axis",
         "the camera's pose is off, or the tool's offset: calibrate both again",
         lambda pose, axis=axis, by=by: make_pose(np.eye(3), by * np.eye(3)[axis]) @ pose,  # type: ignore[misc]
     )

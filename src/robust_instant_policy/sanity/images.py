@@ -8,7 +8,7 @@ import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.sanity.agreement import CLEARLY, Agreement
+from robust_instant_policy.sanity.agreement import CLEARLY, Agreement, exchanged
 from robust_instant_policy.sanity.consistency import MIN_DEMONSTRATIONS
 from robust_instant_policy.sanity.contact import Path
 from robust_instant_policy.sanity.envelope import approaches
@@ -110,7 +110,8 @@ def _measured(today: Evidence) -> str:
         return f"the palm passes {buried * 1e3:.0f} mm deep through what the images show"
     if today.touching < MIN_SHARE:
         if np.isfinite(today.grasp_gap) and today.grasp_gap > TOUCH_M:
-            return f"grasp points lie {today.grasp_gap:.2f} m from any surface, and no path comes nearer than {today.path_gap:.2f} m"
+            grasps = f"grasp points lie {today.grasp_gap:.2f} m from any surface"
+            return f"{grasps}, and no path comes nearer than {today.path_gap:.2f} m"
         return f"paths come no nearer than {today.path_gap:.2f} m to any surface"
     score = today.surroundings.score
     if np.isfinite(score) and score < CONSISTENT:
@@ -179,7 +180,7 @@ def _spread(directions: FloatArray) -> float:
     return float(np.percentile(np.arccos(np.clip(directions @ mean, -1, 1)), 90))
 
 
-def check_agreement(found: Sequence[Agreement]) -> list[Finding]:
+def check_agreement(views: Sequence[View], found: Sequence[Agreement]) -> list[Finding]:
     """Whether colour and depth of the demonstrations show the same scenes."""
     ratios = np.array([one.ratio for one in found])
     if not np.isfinite(ratios).any():
@@ -190,16 +191,21 @@ def check_agreement(found: Sequence[Agreement]) -> list[Finding]:
         low = [i for i, one in enumerate(found) if one.ratio < 1 + (usual - 1) / 4]
         words = f"colour and depth of demonstration {low[0]} show different scenes" if low else ""
         return [Finding("colour and depth", "warning", words, numbers)] if low else []
+    if len({view.depth.shape for view in views}) == 1:
+        moved, best, today = exchanged(views)
+        if moved > len(views) / 2 and best > CLEARLY * today:
+            words = (
+                f"edges of depth are no edges of colour; with other colour images ({moved} of {len(views)}) they are"
+            )
+            advice = f" ({best / max(today, 1e-9):.1f} times stronger): pair each depth image with its own colour image"
+            cause = "colour and depth of different episodes"
+            return [Finding("colour and depth", "error", words + advice, numbers, cause)]
     causes = [one.cause for one in found if one.cause]
     kinds = [cause.split(" (")[0] for cause in causes]
-    if (
-        causes
-        and len(causes) >= MIN_SHARE * len(found)
-        and kinds.count(max(set(kinds), key=kinds.count)) >= MIN_SHARE * len(found)
-    ):
-        cause = causes[kinds.index(max(set(kinds), key=kinds.count))]
-        words = f"edges of depth are no edges of colour ({usual:.1f} times chance); with {cause} they are"
-        return [Finding("colour and depth", "error", words, numbers, f"colour and depth: {cause}")]
+    common = max(set(kinds), key=kinds.count, default="")
+    if common and kinds.count(common) >= MIN_SHARE * len(found):
+        words = f"edges of depth are no edges of colour ({usual:.1f} times chance); with {common} they are"
+        return [Finding("colour and depth", "error", words, numbers, f"colour and depth: {common}")]
     words = f"edges of depth are no edges of colour ({usual:.1f} times chance)"
     advice = ": colour and depth are of different scenes or streams, or the objects look like the table"
     return [Finding("colour and depth", "warning", words + advice, numbers, "colour and depth of different scenes")]

@@ -131,11 +131,11 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
     found += cameras
     found += check_contact(demonstrations, views, paths, poses, today)
     edges = [agreement(view) for view in views]
-    found += check_agreement(edges)
+    found += check_agreement(views, edges)
     spread = scene_spread(views)
     if len(views) > 1 and np.isfinite(spread) and spread < ONE_SCENE_M:
         words = (
-            f"all demonstrations show one scene (objects lie within {spread * 1e3:.1f} mm): other scenes lie outside of "
+            f"all demonstrations show one scene (objects lie within {spread * 1e3:.1f} mm): others lie outside of "
             "what was shown; record with the objects in other places"
         )
         found.append(Finding("one scene", "warning", words, {"scene_spread_m": spread}))
@@ -230,8 +230,8 @@ def _check_novelty(view: View, known: Reference) -> list[Finding]:
     spread = known.scene_spread_m if np.isfinite(known.scene_spread_m) else 0.0
     if distance <= max(OUTSIDE_SPREADS * spread, OUTSIDE_M):
         return []
-    words = f"the objects lie {distance * 100:.0f} cm from where any demonstration has them (these spread by {spread * 100:.1f} cm)"
-    advice = ": the scene lies outside of what was shown"
+    words = f"the objects lie {distance * 100:.0f} cm from where any demonstration has them"
+    advice = f" (these spread by {spread * 100:.1f} cm): the scene lies outside of what was shown"
     return [
         Finding("scene", "warning", words + advice, {"scene_distance_m": distance, "scene_spread_m": spread}, "outside")
     ]

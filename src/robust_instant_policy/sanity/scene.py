@@ -9,17 +9,18 @@ import numpy as np
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.finding import Finding
-from robust_instant_policy.sanity.hypotheses import OF_DEPTH, OF_POSE, TURNS
+from robust_instant_policy.sanity.hypotheses import OF_DEPTH, OF_IMAGES, OF_POSE
 from robust_instant_policy.sanity.scenery import CameraChange, Likeness, Scenery, camera_change
 from robust_instant_policy.sanity.view import View
 
 SAME_PICTURE = 0.9  # share of the scenery's depth that must agree, of what the demonstrations' own agree
 SAME_TEXTURE = 0.5  # of the demonstrations' own correlation
+SURE_TEXTURE = 0.95  # of it, below which an image may be turned round
 CALIBRATION_M, CALIBRATION_RAD = 0.01, np.deg2rad(1.0)  # that a pose may change where the picture does not
 CALIBRATION_K = 0.03  # and the intrinsics, relatively
 TABLE_M, TABLE_RAD = 0.02, np.deg2rad(2.0)  # that the table may differ from the demonstrations'
-RATIO = 0.015  # relative difference of depth that is a scale, not noise
-PEAK = 0.25  # correlation from which a displaced picture is recognised
+PEAK = 0.2  # correlation from which a displaced picture is recognised
+CLEARER = 0.05  # by which a correlation or share must be better to explain a picture
 MIN_PLANE = 0.4
 
 
@@ -35,7 +36,9 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
     if not np.isfinite(like.depth):
         return [Finding("scenery", "unchecked", "too little of the scenery is visible to compare it")]
     same_depth = like.depth >= SAME_PICTURE * scenery.agreed
-    same_texture = not scenery.textured or not like.texture < SAME_TEXTURE * scenery.texture
+    moved = _shifted(view, scenery) if scenery.textured and change.same else None
+    turned = _turned(view, scenery, like, same_depth) if change.same else None
+    same_texture = not scenery.textured or like.texture >= SAME_TEXTURE * scenery.texture
     numbers = {
         "same_depth": like.depth,
         "texture": like.texture,
@@ -43,7 +46,7 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
         "turned": change.turned,
         "intrinsics": change.intrinsics,
     }
-    if same_depth and same_texture:
+    if same_depth and same_texture and not moved and not turned:
         small = change.moved < CALIBRATION_M and change.turned < CALIBRATION_RAD and change.intrinsics < CALIBRATION_K
         if small:
             return []
@@ -51,7 +54,7 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
         words = f"the picture is the demonstrations', but its camera is said to be {change}"
         return [Finding("camera", "error", f"{words}: {cause}", numbers, cause)]
     if change.same:
-        return [_picture_changed(view, scenery, like, same_depth, numbers)]
+        return [_picture_changed(view, scenery, like, same_depth, moved, turned, numbers)]
     return []  # another camera, or one that was moved and calibrated: only the world can be compared
 
 
@@ -71,22 +74,17 @@ def _name_calibration(old: Observation, new: Observation, change: CameraChange) 
 
 
 def _picture_changed(
-    view: View, scenery: Scenery, like: Likeness, same_depth: bool, numbers: dict[str, float]
+    view: View,
+    scenery: Scenery,
+    like: Likeness,
+    same_depth: bool,
+    moved: tuple[int, int] | None,
+    turned: tuple[str, str] | None,
+    numbers: dict[str, float],
 ) -> Finding:
     """The camera is said to be the same, and the picture is not: name what restores it."""
-    for what, rows, cols in TURNS:
-        turned = scenery.likeness(view, rows, cols)
-        if (
-            scenery.textured
-            and turned.texture >= SAME_TEXTURE * scenery.texture
-            and turned.texture > like.texture + 0.2
-        ):
-            which = "the image is" if not same_depth or _symmetric(scenery, rows, cols) else "the colour image is"
-            words = f"{which} {what}: turned back, its texture agrees by {turned.texture:.2f} (now {like.texture:.2f})"
-            return Finding("scenery", "error", words, numbers, f"image {what}")
-        if not same_depth and turned.depth >= SAME_PICTURE * scenery.agreed and turned.depth > like.depth + 0.05:
-            words = f"the depth image is {what}: turned back, {turned.depth:.0%} of the scenery agree (now {like.depth:.0%})"
-            return Finding("scenery", "error", words, numbers, f"depth {what}")
+    if turned:
+        return Finding("scenery", "error", turned[1], numbers, turned[0])
     texture_holds = scenery.textured and like.texture >= SAME_TEXTURE * scenery.texture
     if not same_depth and (texture_holds or not scenery.textured or abs(like.ratio - 1) > 0.3):
         numbers = {**numbers, "ratio": like.ratio, "offset": like.offset}
@@ -98,31 +96,49 @@ def _picture_changed(
                 return Finding(
                     "scenery", "error", f"{words}; with {cause} it agrees: {hypothesis.remedy}", numbers, cause
                 )
-        words = f"depth reads {like.ratio:.3g} times the demonstrations' ({like.offset * 100:+.1f} cm) over the same scenery"
+        words = f"depth reads {like.ratio:.3g} times the demonstrations' ({like.offset * 100:+.1f} cm)"
         advice = (
             "; check the depth unit and calibration, and whether the camera was moved towards or away from the table"
         )
         return Finding("scenery", "error", words + advice, numbers, "depth scale, or camera moved")
-    if scenery.textured:
-        cols, rows, peak = scenery.shift(view)
-        if peak >= PEAK * scenery.texture and (cols or rows):
-            metres = np.hypot(cols, rows) * np.nanmedian(view.depth) / abs(view.observation.intrinsics[0, 0])
-            words = f"the camera was moved: the scenery lies {cols:+d}, {rows:+d} pixels ({metres * 100:.0f} cm) beside where it was"
-            advice = "; calibrate it anew, or put it back"
-            return Finding("scenery", "error", words + advice, {**numbers, "shift": float(metres)}, "camera moved")
+    if moved:
+        cols, rows = moved
+        metres = float(np.hypot(cols, rows) * np.nanmedian(view.depth) / abs(view.observation.intrinsics[0, 0]))
+        words = f"the camera was moved: the scenery is displaced by {cols:+d}, {rows:+d} pixels ({metres * 100:.0f} cm)"
+        advice = "; calibrate it anew, or put it back"
+        return Finding("scenery", "error", words + advice, {**numbers, "shift": metres}, "camera moved")
     if not same_depth:
         words = f"{like.depth:.0%} of the scenery's depth are as in the demonstrations"
         advice = ": the camera was moved, or the depth is of another scene or stream"
         return Finding("scenery", "error", words + advice, numbers, "camera moved")
-    words = f"the scenery looks different from the demonstrations' (texture agrees by {like.texture:.2f}, there {scenery.texture:.2f})"
+    words = f"the scenery looks different (texture agrees by {like.texture:.2f}, in the demonstrations {scenery.texture:.2f})"
     advice = ": the camera was moved, the colour image is of another stream, or the table is covered"
     return Finding("scenery", "error", words + advice, numbers, "camera moved, or another colour image")
 
 
-def _symmetric(scenery: Scenery, rows: int, cols: int) -> bool:
-    """Whether the scenery's depth turned round is the same, so that depth cannot say if it was turned."""
-    both = scenery.static & scenery.static[::rows, ::cols]
-    return bool((np.abs(scenery.depth - scenery.depth[::rows, ::cols]) < 0.006)[both].mean() > SAME_PICTURE)
+def _turned(view: View, scenery: Scenery, like: Likeness, same_depth: bool) -> tuple[str, str] | None:
+    """Cause and message where the picture, turned round or mirrored, is the demonstrations'."""
+    if same_depth and not like.texture < SURE_TEXTURE * scenery.texture:
+        return None
+    for hypothesis in OF_IMAGES:
+        turned = scenery.likeness(View.of(hypothesis.correct(view.observation)))
+        what = hypothesis.cause.removeprefix("the image ")
+        enough = max(SAME_TEXTURE * scenery.texture, like.texture + CLEARER)
+        if scenery.textured and turned.texture > enough and (same_depth or turned.depth >= like.depth - CLEARER):
+            words = (
+                f"the image is {what}: turned back, its texture agrees by {turned.texture:.2f} (now {like.texture:.2f})"
+            )
+            return f"colour image {what}", f"{words}; {hypothesis.remedy}"
+        if turned.depth >= SAME_PICTURE * scenery.agreed and turned.depth > like.depth + CLEARER:
+            words = f"the depth image is {what}: turned back, {turned.depth:.0%} of it agree (now {like.depth:.0%})"
+            return f"depth image {what}", f"{words}; {hypothesis.remedy}"
+    return None
+
+
+def _shifted(view: View, scenery: Scenery) -> tuple[int, int] | None:
+    """By how many columns and rows the picture is displaced, None where its texture fits best as it is."""
+    cols, rows, peak, here = scenery.shift(view)
+    return (cols, rows) if (cols or rows) and peak >= PEAK and peak > here + CLEARER else None
 
 
 def check_table(view: View, plane: FloatArray, centre: FloatArray) -> list[Finding]:

@@ -21,6 +21,7 @@ DEPTH_M = 0.006  # and at least this
 STATIC = 0.8  # share of the images that must agree on a pixel for it to be scenery
 DETAIL_PX = 3.0  # texture is what remains of the brightness without what is smoother than this
 MIN_TEXTURE = 0.35  # correlation of the demonstrations' own texture below which colour decides nothing
+MIN_PIXELS = 50  # fewer say nothing
 BRIGHTNESS_NOISE = 1.0  # of 255
 
 
@@ -62,7 +63,7 @@ def detail(rgb: NDArray[np.float32]) -> FloatArray:
 
 def correlation(a: FloatArray, b: FloatArray, mask: NDArray[np.bool_]) -> float:
     """Pearson's correlation of two images where ``mask`` is set; outliers such as objects are cut off first."""
-    if mask.sum() < 50:
+    if mask.sum() < MIN_PIXELS:
         return float("nan")
     x, y = a[mask], b[mask]
     x, y = (np.clip(v, *np.percentile(v, [1, 99])) for v in (x, y))
@@ -123,33 +124,31 @@ class Scenery:
         """Whether the background's texture repeats in the images themselves, so that it can be compared."""
         return bool(self.texture >= MIN_TEXTURE)
 
-    def likeness(self, view: View, rows: int = 1, cols: int = 1) -> Likeness:
-        """Of ``view``, its images turned round along the axes whose step is -1."""
-        depth, rgb = view.depth[::rows, ::cols], view.rgb[::rows, ::cols]
-        if depth.shape != self.depth.shape:
+    def likeness(self, view: View) -> Likeness:
+        """Of ``view`` where the scenery is not hidden by what stands on the table."""
+        if view.depth.shape != self.depth.shape:
             return Likeness(float("nan"), float("nan"), float("nan"), float("nan"))
-        both = self.static & np.isfinite(depth)
         tolerance = np.maximum(DEPTH_M, DEPTH_SHARE * self.depth) + 3 * view.noise
-        # objects stand on static pixels, too: what is nearer than the scenery is left out
-        clear = both & ~view.raised[::rows, ::cols]
-        if clear.sum() < 50:
+        clear = self.static & np.isfinite(view.depth) & ~view.raised
+        if clear.sum() < MIN_PIXELS:
             return Likeness(float("nan"), float("nan"), float("nan"), float("nan"))
-        share = float((np.abs(depth - self.depth) < tolerance)[clear].mean())
+        old, new = self.depth[clear], view.depth[clear]
         return Likeness(
-            share,
-            correlation(detail(self.rgb), detail(rgb), clear),
-            float(np.median(depth[clear] / self.depth[clear])),
-            float(np.median(depth[clear] - self.depth[clear])),
+            float((np.abs(new - old) < tolerance[clear]).mean()),
+            correlation(detail(self.rgb), detail(view.rgb), clear),
+            float(np.median(new / old)),
+            float(np.median(new - old)),
         )
 
-    def shift(self, view: View) -> tuple[int, int, float]:
-        """The displacement (columns, rows, in full pixels) at which the texture of ``view`` fits best, and the
-        height of that peak as a correlation."""
+    def shift(self, view: View) -> tuple[int, int, float, float]:
+        """The displacement (columns, rows, in full pixels) at which the texture of ``view`` fits best, the correlation
+        there, and that without displacement."""
         a, b = detail(self.rgb), detail(view.rgb)
         a, b = (np.clip(v, *np.percentile(v, [1, 99])) for v in (a, b))
+        a, b = np.where(self.static, a, 0), np.where(view.raised, 0, b)
         spectrum = np.fft.rfft2(a).conj() * np.fft.rfft2(b)
         peaks = np.fft.irfft2(spectrum, s=a.shape) / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-9)
         row, col = np.unravel_index(int(peaks.argmax()), peaks.shape)
         height, width = a.shape
         rows, cols = (int(row) + height // 2) % height - height // 2, (int(col) + width // 2) % width - width // 2
-        return cols * view.every, rows * view.every, float(peaks.max())
+        return cols * view.every, rows * view.every, float(peaks.max()), float(peaks[0, 0])
