@@ -111,7 +111,7 @@ def _picture_changed(
         words = f"{like.depth:.0%} of the scenery's depth are as in the demonstrations"
         advice = ": the camera was moved, or the depth is of another scene or stream"
         return Finding("scenery", "error", words + advice, numbers, "camera moved")
-    words = f"the scenery looks different (texture agrees by {like.texture:.2f}, in the demonstrations {scenery.texture:.2f})"
+    words = f"the scenery looks different (texture agrees by {like.texture:.2f}, theirs by {scenery.texture:.2f})"
     advice = ": the camera was moved, the colour image is of another stream, or the table is covered"
     return Finding("scenery", "error", words + advice, numbers, "camera moved, or another colour image")
 
