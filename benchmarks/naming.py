@@ -16,9 +16,9 @@ import numpy as np
 from stored_proposals import NUM_DEMOS, NUM_QUERIES, arguments, proposals
 
 from robust_instant_policy.evaluation import STORE_FILE, Variant, open_episodes
-from robust_instant_policy.evaluation.tables import Table
 from robust_instant_policy.llm import model_name
 from robust_instant_policy.policies.rip import robust_plan
+from robust_instant_policy.reporting.tables import Table
 
 COLUMNS = ("fail, named", "succeed, named", "fail, named without", "succeed, named without")
 NOTE = "Candidates that fail or succeed when executed alone, in scenes in which RIP succeeds."

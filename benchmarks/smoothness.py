@@ -16,10 +16,10 @@ import numpy as np
 from pick_and_place import key_error
 from stored_proposals import NUM_DEMOS, arguments, proposals
 
-from robust_instant_policy.evaluation.tables import Table
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.instant import Proposal
 from robust_instant_policy.policies.rip import DOF, robust_plan
+from robust_instant_policy.reporting.tables import Table
 from robust_instant_policy.trajectory import Trajectory
 
 COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, bends unknown", "robust")

@@ -35,14 +35,14 @@ from robust_instant_policy.evaluation import (
 from robust_instant_policy.evaluation.experiment import missing_work, plan_file, wanted_plans
 from robust_instant_policy.evaluation.failures import video_file
 from robust_instant_policy.evaluation.manifest import Manifest, invocation
-from robust_instant_policy.evaluation.publication import publish
 from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test, wilson_interval
 from robust_instant_policy.evaluation.summary import Summary
-from robust_instant_policy.evaluation.tables import tables
 from robust_instant_policy.evaluation.variant import labels
 from robust_instant_policy.evaluation.work import MAX_DEATHS, Agenda, SceneWork
 from robust_instant_policy.llm import SampleStore
 from robust_instant_policy.query import Answer, Query
+from robust_instant_policy.reporting.publication import publish
+from robust_instant_policy.reporting.tables import tables
 
 RIP = Variant("rip", model="a model")
 KAT = Variant("kat", model="a model")

@@ -34,9 +34,9 @@ from robust_instant_policy.evaluation.cluster import Cluster
 from robust_instant_policy.evaluation.failures import Inquest, film, true_keypoints, video_file
 from robust_instant_policy.evaluation.manifest import invocation
 from robust_instant_policy.evaluation.processes import Processes
-from robust_instant_policy.evaluation.publication import publish
 from robust_instant_policy.files import lock_folder
 from robust_instant_policy.policies import KeypointContext, Neighbours
+from robust_instant_policy.reporting.publication import publish
 from robust_instant_policy.tasks import make_task
 
 SHOWN = 3

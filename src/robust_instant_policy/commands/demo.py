@@ -102,7 +102,7 @@ def _run(
         screen.say(f"    {stage.name:<32}{stage.seconds:7.3f} s{tokens}")
     ignored = [f"{index + 1} from step {plan.onset[index]}" for index in np.flatnonzero(plan.hallucinated)]
     screen.say(
-        f"    {len(plan.candidates)} candidates, hallucinating: {', '.join(ignored) or 'none'}; "
+        f"    {len(plan.candidates)} candidates, hallucinated: {', '.join(ignored) or 'none'}; "
         f"confidence {plan.confidence:.2f}"
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole, TrainingScreen
@@ -25,10 +26,11 @@ from robust_instant_policy.evaluation.cluster import Cluster
 from robust_instant_policy.evaluation.episodes import EPISODES_FILE
 from robust_instant_policy.evaluation.manifest import invocation
 from robust_instant_policy.evaluation.processes import Processes
-from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
 from robust_instant_policy.evaluation.work import Hands, Outcome
 from robust_instant_policy.llm import model_name
 from robust_instant_policy.policies.training import DEFAULT_STEPS
+from robust_instant_policy.reporting.publication import PAGE_FILE, publish
+from robust_instant_policy.reporting.training import keep_training_picture
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -123,8 +125,9 @@ def evaluate(
             screen.say(f"  {what.scene} {what.variant} #{what.candidate}: {verdict}")
         screen.done_so_far("plans executed", done, total)
 
+    progress = Progress(recording, outcome, TrainingScreen(screen), partial(keep_training_picture, out))
     with invocation(out, suites, arguments, model_name(setup.llm)), screen.stage("evaluation"):
-        run_suites(suites, setup, out, _hands(workers, ray), Progress(recording, outcome, TrainingScreen(screen)))
+        run_suites(suites, setup, out, _hands(workers, ray), progress)
     screen.say("")
     screen.say(publish(out))
     screen.say(f"rows: {out / EPISODES_FILE}; all of it: {out / PAGE_FILE}")

@@ -14,7 +14,7 @@ from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.evaluation import scene_seed
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.perception.accuracy import Accuracy, measure
-from robust_instant_policy.perception.page import keypoints_page
+from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from robust_instant_policy.evaluation.merging import Share, merge
-from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
+from robust_instant_policy.reporting.publication import PAGE_FILE, publish
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

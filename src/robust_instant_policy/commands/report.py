@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from robust_instant_policy.evaluation.episodes import holds_episodes
-from robust_instant_policy.evaluation.publication import PAGE_FILE, publish
+from robust_instant_policy.reporting.publication import PAGE_FILE, publish
 from robust_instant_policy.reporting.run import write_report
 
 

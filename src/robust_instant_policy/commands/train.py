@@ -14,7 +14,7 @@ from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import TRAINED_METHODS, KeypointContext, make_trained_policy
 from robust_instant_policy.policies.training import DEFAULT_STEPS, Training
-from robust_instant_policy.policies.training_picture import training_picture
+from robust_instant_policy.reporting.training import training_picture
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from robust_instant_policy.commands.options import beside
-from robust_instant_policy.datasets.page import write_page
+from robust_instant_policy.reporting.demonstrations import write_page
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,8 +1,7 @@
 """Demonstrations on disk: LeRobotDataset v3.0 folders with the start-of-episode depth and camera."""
 
-from robust_instant_policy.datasets.page import write_page
 from robust_instant_policy.datasets.reader import load_demonstrations, load_frames
 from robust_instant_policy.datasets.video import VideoWriter
 from robust_instant_policy.datasets.writer import DatasetWriter
 
-__all__ = ["DatasetWriter", "VideoWriter", "load_demonstrations", "load_frames", "write_page"]
+__all__ = ["DatasetWriter", "VideoWriter", "load_demonstrations", "load_frames"]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from robust_instant_policy.evaluation.episodes import Episode, open_episodes
 from robust_instant_policy.evaluation.failures import Failure, open_failures, video_file
@@ -18,8 +19,10 @@ from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.files import lock_folder, make_folder, write_whole
 from robust_instant_policy.policies import IMAGE_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import TrainingReport, no_report
-from robust_instant_policy.policies.training_picture import training_picture
 from robust_instant_policy.tasks import make_task
+
+if TYPE_CHECKING:  # it needs the extra "train"
+    from robust_instant_policy.policies.diffusion.training import TrainedPolicy
 
 PLAN_FOLDER, TRAINING_FOLDER = "plans", "training"
 
@@ -29,12 +32,14 @@ Plan = tuple[Scene, Variant]
 @dataclass(frozen=True)
 class Progress:
     """Called as the run goes on: ``recording(task, there, wanted, thrown away)``, ``outcome(plans done, plans wanted,
-    what has just come, or None at the start)``, and ``training`` while a method is trained.
+    what has just come, or None at the start)``, ``training`` while a method is trained, and ``trained(task, variant,
+    policy)`` when that is done.
     """
 
     recording: Callable[[str, int, int, int], None]
     outcome: Callable[[int, int, Outcome | None], None]
     training: TrainingReport = no_report
+    trained: Callable[[str, Variant, TrainedPolicy], None] = lambda task, variant, policy: None
 
 
 def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, progress: Progress) -> None:
@@ -54,7 +59,7 @@ def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, p
         if not works:
             return
         _record_missing(works, setup, progress)
-        _train_missing(works, setup, out, progress)
+        _train_missing(works, setup, progress)
         for outcome in hands(setup, works):
             if isinstance(outcome, Episode):
                 episodes.add(outcome)
@@ -168,8 +173,8 @@ def _record_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress
             task.close()
 
 
-def _train_missing(works: Sequence[SceneWork], setup: Setup, out: Path, progress: Progress) -> None:
-    """Have checkpoints of everything that is trained, before workers would all train it at once, and pictures of it."""
+def _train_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:
+    """Have checkpoints of everything that is trained, before workers would all train it at once."""
     trained: dict[tuple[str, Variant], SceneWork] = {}
     for work in works:
         for variant in work.concerned:
@@ -179,8 +184,4 @@ def _train_missing(works: Sequence[SceneWork], setup: Setup, out: Path, progress
         return
     with closing(Workbench(setup, report=progress.training)) as bench:
         for (task, variant), work in trained.items():
-            policy = bench.train(work, variant)
-            picture = out / training_file(task, variant)
-            if not picture.exists():
-                picture.parent.mkdir(exist_ok=True)
-                write_whole(picture, training_picture(policy))
+            progress.trained(task, variant, bench.train(work, variant))

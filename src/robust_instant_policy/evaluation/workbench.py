@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
@@ -26,10 +26,12 @@ from robust_instant_policy.policies import (
     make_policy,
 )
 from robust_instant_policy.policies.training import TrainingReport, no_report
-from robust_instant_policy.policies.training_picture import TrainedPolicy
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Task
+
+if TYPE_CHECKING:  # it needs the extra "train"
+    from robust_instant_policy.policies.diffusion.training import TrainedPolicy
 
 AnyPolicy = Policy | ClosedLoopPolicy
 Context = tuple[int, str, str, str, str]  # demonstrations, downsampling, frames, layout, features
@@ -80,7 +82,7 @@ class Workbench:
     def train(self, work: SceneWork, variant: Variant) -> TrainedPolicy:
         """Make and train the policy of ``variant`` for the scenes of ``work``, as `run` would."""
         self._enter(work.scene)
-        return cast(TrainedPolicy, self._policy(variant, self._show(work)))
+        return cast("TrainedPolicy", self._policy(variant, self._show(work)))
 
     def close(self) -> None:
         if self._task is not None:

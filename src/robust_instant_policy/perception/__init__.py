@@ -2,7 +2,6 @@
 
 from robust_instant_policy.perception.accuracy import Accuracy, KnownScene, measure
 from robust_instant_policy.perception.keypoints import KeypointExtractor, Located
-from robust_instant_policy.perception.page import keypoints_page
 from robust_instant_policy.perception.settings import PAPER_REAL, PAPER_SIMULATION, DescriptorSettings
 
 __all__ = [
@@ -13,6 +12,5 @@ __all__ = [
     "KeypointExtractor",
     "KnownScene",
     "Located",
-    "keypoints_page",
     "measure",
 ]

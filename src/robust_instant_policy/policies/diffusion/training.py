@@ -73,6 +73,14 @@ class Rehearsal:
     samples: FloatArray
 
 
+class TrainedPolicy(Protocol):
+    """A policy that was fitted by training, and can say what it would do where it was shown what to do."""
+
+    trained_: Trained
+
+    def rehearse(self, count: int) -> list[Rehearsal]: ...
+
+
 def obtain(
     make_model: Callable[[], Denoiser],
     make_data: Callable[[], TrainingData],

@@ -1,57 +1,10 @@
-<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width,initial-scale=1">
-<title>%%title</title>
-<style>
-:root{--ink:#1b1b1b;--soft:#666;--line:#e4e4e0;--page:#fafaf8;--panel:#fff;--open:#2e86ab;--closed:#d9730d;--grid:#dcdcd6}
-*{box-sizing:border-box}
-body{font:16px/1.5 system-ui,sans-serif;color:var(--ink);background:var(--page);margin:0}
-main{max-width:1180px;margin:0 auto;padding:24px}
-h1{margin:0 0 4px;font-size:30px}
-h2{margin:0;font-size:18px}
-p{max-width:80ch;margin:6px 0}
-.soft,figcaption{color:var(--soft);font-size:14px}
-.facts{display:flex;flex-wrap:wrap;gap:8px 28px;margin:14px 0 18px;padding:0;list-style:none}
-.facts b{display:block;font-size:20px;font-weight:600;font-variant-numeric:tabular-nums}
-.facts li{color:var(--soft);font-size:14px}.facts b{color:var(--ink)}
-.panel{background:var(--panel);border:1px solid var(--line);border-radius:6px;padding:14px}
-.episode{margin-top:18px}
-.head{display:flex;flex-wrap:wrap;gap:2px 18px;align-items:baseline;margin-bottom:10px}
-.views{display:grid;grid-template-columns:repeat(auto-fit,minmax(230px,1fr));gap:14px}
-figure{margin:0;min-width:0}
-figure>.frame{position:relative;background:#f1f1ee;border-radius:4px;overflow:hidden;aspect-ratio:4/3}
-.frame>*{position:absolute;inset:0;width:100%;height:100%;object-fit:contain;display:block}
-.frame video{background:#000}.frame.space{background:var(--panel);border:1px solid var(--line)}
-canvas{cursor:grab;touch-action:none}canvas:active{cursor:grabbing}
-#all{display:block;width:100%;height:380px}
-.time{margin-top:12px}
-.time svg{display:block;width:100%;height:76px;cursor:ew-resize;touch-action:none}
-.time figcaption{display:flex;justify-content:space-between}
-.now{font-variant-numeric:tabular-nums}
-.key{display:inline-block;width:18px;height:4px;border-radius:2px;vertical-align:middle;margin-right:5px}
-.key.open{background:var(--open)}.key.closed{background:var(--closed)}
-.legend{max-width:none}.legend span{margin-right:18px}
-</style>
-</head>
-<body>
-<main>
-<h1>%%heading</h1>
-<p class="soft">%%subtitle</p>
-<ul class="facts">%%facts</ul>
-<div class="panel">
-<canvas id="all" aria-label="the paths of all episodes in 3-D"></canvas>
-<p class="soft legend"><span><i class="key open"></i>gripper open</span><span><i class="key closed"></i>gripper closed</span>
-<span>dot: start, square: end</span><span>grid: %%grid</span><span>drag to turn all views, scroll to zoom</span></p>
-</div>
-%%episodes
-</main>
-<script type="application/json" id="data">%%data</script>
-<script>
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
-const OPEN = "#2e86ab", CLOSED = "#d9730d";
+const colour = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+let INK, SOFT, GRID, OPEN, CLOSED;
+function readColours() {
+  [INK, SOFT, GRID, OPEN, CLOSED] = ["--ink", "--soft", "--line", "--open", "--closed"].map(colour);
+}
 const view = {turn: -0.9, tilt: 0.6, zoom: 1};
 const [low, high] = data.bounds, middle = low.map((v, i) => (v + high[i]) / 2);
 const floorFrom = i => Math.floor(low[i] / data.grid) * data.grid, floorTo = i => Math.ceil(high[i] / data.grid) * data.grid;
@@ -63,7 +16,7 @@ function flat(p, turn, tilt) {
   return [right, -Math.sin(tilt) * away - Math.cos(tilt) * z];
 }
 
-// Everything fits at first sight; turning keeps that scale, so that nothing pulsates.
+// One scale for all directions, so that the size does not change while the view turns.
 const extent = [0, 1].map(i => Math.max(...corners.map(p => Math.abs(flat(p, view.turn, view.tilt)[i]))));
 
 function projector(canvas) {
@@ -80,21 +33,21 @@ function line(pen, points, colour, width) {
 function floor(pen, at, unit) {
   const step = data.grid, z = low[2];
   const from = floorFrom, to = floorTo;
-  for (let x = from(0); x <= to(0) + 1e-9; x += step) line(pen, [at([x, from(1), z]), at([x, to(1), z])], "#dcdcd6", unit);
-  for (let y = from(1); y <= to(1) + 1e-9; y += step) line(pen, [at([from(0), y, z]), at([to(0), y, z])], "#dcdcd6", unit);
+  for (let x = from(0); x <= to(0) + 1e-9; x += step) line(pen, [at([x, from(1), z]), at([x, to(1), z])], GRID, unit);
+  for (let y = from(1); y <= to(1) + 1e-9; y += step) line(pen, [at([from(0), y, z]), at([to(0), y, z])], GRID, unit);
   const corner = [from(0), from(1), z];
-  pen.font = `${11 * unit}px system-ui,sans-serif`; pen.fillStyle = "#666"; pen.textAlign = "center";
+  pen.font = `${11 * unit}px system-ui,sans-serif`; pen.fillStyle = SOFT; pen.textAlign = "center";
   ["x", "y", "z"].forEach((name, i) => {
     const tip = corner.slice(); tip[i] += step;
     const label = corner.slice(); label[i] += step * 1.35;
-    line(pen, [at(corner), at(tip)], "#666", 1.5 * unit);
+    line(pen, [at(corner), at(tip)], SOFT, 1.5 * unit);
     const [u, v] = at(label); pen.fillText(name, u, v + 4 * unit);
   });
 }
 
 function path(pen, at, arm, unit, width) {
   const points = arm.points.map(at);
-  line(pen, arm.points.map(p => at([p[0], p[1], low[2]])), "rgba(0,0,0,.10)", width * unit);
+  line(pen, arm.points.map(p => at([p[0], p[1], low[2]])), GRID, width * unit);
   for (let i = 1; i < points.length; i++)
     line(pen, [points[i - 1], points[i]], arm.closed[i - 1] ? CLOSED : OPEN, width * unit);
   const r = 2 * width * unit, [a, b] = [points[0], points[points.length - 1]];
@@ -103,10 +56,10 @@ function path(pen, at, arm, unit, width) {
 }
 
 function gripper(pen, at, arm, step, unit) {
-  const [palm, left, right] = arm.grippers[step].map(at);
+  const [point, left, right] = arm.grippers[step].map(at);
   pen.lineCap = "round";
-  line(pen, [left, palm, right, left], "#111", 2.2 * unit);
-  pen.fillStyle = "#111"; pen.beginPath(); pen.arc(...palm, 3.2 * unit, 0, 7); pen.fill();
+  line(pen, [left, point, right, left], INK, 2.2 * unit);
+  pen.fillStyle = INK; pen.beginPath(); pen.arc(...point, 3.2 * unit, 0, 7); pen.fill();
 }
 
 function fit(canvas) {
@@ -157,7 +110,7 @@ const cards = [...document.querySelectorAll(".episode")].map((card, index) => {
 });
 
 const all = document.getElementById("all");
-function drawAll() { draw(all, data.episodes); cards.forEach(card => card.draw()); }
+function drawAll() { readColours(); draw(all, data.episodes); cards.forEach(card => card.draw()); }
 for (const canvas of [all, ...cards.map(card => card.canvas)]) {
   let last = null;
   canvas.addEventListener("pointerdown", event => { last = event; canvas.setPointerCapture(event.pointerId); });
@@ -176,8 +129,7 @@ for (const canvas of [all, ...cards.map(card => card.canvas)]) {
   }, {passive: false});
 }
 window.addEventListener("resize", drawAll);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
+readColours();
 cards.forEach(card => card.show(0));
 drawAll();
-</script>
-</body>
-</html>

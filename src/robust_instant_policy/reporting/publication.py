@@ -1,4 +1,4 @@
-"""A run's folder turned into what people look at: tables, figures and one page, whenever its rows came."""
+"""The tables, figures and the page of an evaluation, written from its rows."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.episodes import open_episodes
 from robust_instant_policy.evaluation.experiment import TRAINING_FOLDER, plan_file, wanted_plans
 from robust_instant_policy.evaluation.failures import open_failures
-from robust_instant_policy.evaluation.figures import draw, encode
 from robust_instant_policy.evaluation.manifest import Manifest
-from robust_instant_policy.evaluation.page import Section, write_page
 from robust_instant_policy.evaluation.suites import CHOSEN, Suite
 from robust_instant_policy.evaluation.summary import Summary
-from robust_instant_policy.evaluation.tables import Table, failure_table, invocation_table, tables
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.policies import Plan
+from robust_instant_policy.reporting.evaluation import Section, evaluation_page
+from robust_instant_policy.reporting.figures import draw, encode
+from robust_instant_policy.reporting.tables import Table, failure_table, invocation_table, tables
 
 TABLE_FILE = "table.md"
 FAILURE_TABLE_FILE = "failures.md"
@@ -52,7 +52,7 @@ def publish(out: Path) -> str:
     invocations = invocation_table(manifest.invocations, rows)
     write_whole(out / RUN_TABLE_FILE, invocations.markdown().encode())
     trainings = {path.stem: path.read_bytes() for path in sorted((out / TRAINING_FOLDER).glob("*.svg"))}
-    page = write_page(out, sections, trainings, rows, failures, lost, invocations)
+    page = evaluation_page(out, sections, trainings, rows, failures, lost, invocations)
     write_whole(out / PAGE_FILE, page.encode())
     return text
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import html
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -32,16 +30,6 @@ class Table:
     def markdown(self) -> str:
         lines = [self.head, tuple("---" for _ in self.head), *self.rows]
         return "\n".join(f"| {' | '.join(line)} |" for line in lines) + f"\n\n{self.note}\n"
-
-    def html(self) -> str:
-        head = "".join(f"<th>{_html(cell)}</th>" for cell in self.head)
-        rows = "".join("<tr>" + "".join(f"<td>{_html(cell)}</td>" for cell in row) + "</tr>" for row in self.rows)
-        return f"<table><tr>{head}</tr>{rows}</table><p class='note'>{_html(self.note)}</p>"
-
-
-def _html(cell: str) -> str:
-    text = re.sub(r"\*\*(\S.*?)\*\*", r"<b>\1</b>", html.escape(cell)).replace("\\*", "*")
-    return re.sub(r"`(.+?)`", r"<code>\1</code>", text)
 
 
 def tables(summary: Summary) -> list[Table]:

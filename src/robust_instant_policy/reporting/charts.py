@@ -1,0 +1,202 @@
+"""Interactive charts of a plan: paths in 3-D, weights, and every action dimension over time."""
+
+from __future__ import annotations
+
+import numpy as np
+import plotly.graph_objects as go
+from markupsafe import Markup
+from plotly.subplots import make_subplots
+
+from robust_instant_policy.geometry import GripperTriangle
+from robust_instant_policy.policies.policy import Plan
+from robust_instant_policy.reporting.pictures import keypoint_colour, tool_points
+from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
+
+MM = 1000.0
+AXIS_STEPS = 6  # gripper axes drawn along the robust trajectory
+AXIS_LENGTH_M = 0.03
+AXES = (("#d62728", "gripper x"), ("#2ca02c", "gripper y (opening)"), ("#1f77b4", "gripper z (approach)"))
+COLUMNS = 3  # of charts side by side
+WEIGHT_COLOURS = "Viridis_r"  # dark: followed, pale: ignored
+ROBUST_COLOUR = "#111111"
+HALLUCINATED_COLOUR = "#d1495b"
+CANDIDATE_COLOURS = (
+    "#2e86ab", "#3fa34d", "#a06cd5", "#e09f3e", "#17817b", "#7d4f50", "#5c6f91", "#b56576", "#6b8f71", "#8d99ae",
+)  # fmt: skip
+DIMENSIONS = tuple(f"{point} {axis}" for point in ("gripper point", "fingertip 1", "fingertip 2") for axis in "xyz")
+
+
+def chart(figure: go.Figure) -> Markup:
+    """HTML of ``figure`` for a page that holds plotly's script already."""
+    config = {"displaylogo": False, "responsive": True}
+    return Markup(figure.to_html(include_plotlyjs=False, full_html=False, config=config))
+
+
+def candidate_name(plan: Plan, index: int) -> str:
+    return f"candidate {index + 1}" + (" (hallucinated)" if plan.hallucinated[index] else "")
+
+
+def candidate_colour(plan: Plan, index: int) -> str:
+    return HALLUCINATED_COLOUR if plan.hallucinated[index] else CANDIDATE_COLOURS[index % len(CANDIDATE_COLOURS)]
+
+
+def paths_in_space(plan: Plan) -> go.Figure:
+    """Fingertip paths in the world, candidates coloured by weight, with the gripper's axes along the robust one."""
+    figure = go.Figure()
+    for index, candidate in enumerate(plan.candidates):
+        weight = np.interp(candidate.times, plan.trajectory.times, plan.weights[index])
+        shade = {"color": weight, "colorscale": WEIGHT_COLOURS, "cmin": 0, "cmax": 1}
+        for arm in range(candidate.num_arms):
+            x, y, z = (tool_points(candidate, arm) * MM).T
+            figure.add_scatter3d(
+                x=x,
+                y=y,
+                z=z,
+                mode="lines+markers",
+                name=candidate_name(plan, index),
+                showlegend=False,
+                line={**shade, "width": 4},
+                marker={
+                    **shade,
+                    "size": 3,
+                    "symbol": "x" if plan.hallucinated[index] else "circle",
+                    "showscale": index == 0 and arm == 0,
+                    "colorbar": {"title": "weight", "thickness": 14, "len": 0.6},
+                },
+                customdata=np.stack([weight, np.arange(len(candidate))], axis=1),
+                hovertemplate="step %{customdata[1]:.0f}, weight %{customdata[0]:.2f}<extra>%{fullData.name}</extra>",
+            )
+    for arm in range(plan.trajectory.num_arms):
+        _add_robust_path(figure, plan, arm)
+    x, y, z = (plan.keypoints.reshape(-1, 3) * MM).T
+    figure.add_scatter3d(
+        x=x,
+        y=y,
+        z=z,
+        mode="markers+text",
+        name="keypoints",
+        text=[str(k) for k in range(len(x))],
+        marker={"size": 5, "color": [keypoint_colour(k) for k in range(len(x))]},
+    )
+    axes = {f"{axis}axis_title": f"world {axis} [mm]" for axis in "xyz"}
+    figure.update_layout(
+        height=620,
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        legend={"x": 0, "y": 1},
+        scene={"aspectmode": "data", "camera": {"eye": {"x": 1.3, "y": -1.5, "z": 1.1}}, **axes},
+    )
+    return figure
+
+
+def _add_robust_path(figure: go.Figure, plan: Plan, arm: int) -> None:
+    x, y, z = (tool_points(plan.trajectory, arm) * MM).T
+    figure.add_scatter3d(
+        x=x,
+        y=y,
+        z=z,
+        mode="lines+markers",
+        name="robust trajectory",
+        legendgroup="robust",
+        showlegend=arm == 0,
+        line={"color": ROBUST_COLOUR, "width": 9},
+        marker={"color": ROBUST_COLOUR, "size": 3},
+    )
+    triplets = plan.trajectory.triplets[:, arm]
+    poses = GripperTriangle.from_triplets(triplets).poses(triplets)
+    for step in np.unique(np.linspace(0, len(poses) - 1, AXIS_STEPS).astype(int)):
+        origin, rotation = poses[step, :3, 3], poses[step, :3, :3]
+        for axis, (colour, name) in enumerate(AXES):
+            x, y, z = (np.stack([origin, origin + AXIS_LENGTH_M * rotation[:, axis]]) * MM).T
+            figure.add_scatter3d(
+                x=x,
+                y=y,
+                z=z,
+                mode="lines",
+                line={"color": colour, "width": 5},
+                name=name,
+                legendgroup=name,
+                showlegend=bool(step == 0 and arm == 0),
+                hoverinfo="name",
+            )
+
+
+def weights_over_time(plan: Plan) -> go.Figure:
+    """Weight of every candidate at every step of the plan, as a heat map."""
+    names = [candidate_name(plan, index) for index in range(len(plan.candidates))]
+    figure = go.Figure(
+        go.Heatmap(
+            z=plan.weights, x=list(range(plan.weights.shape[1])), y=names, zmin=0, zmax=1, colorscale=WEIGHT_COLOURS,
+            colorbar={"title": "weight", "thickness": 14}, xgap=1, ygap=2,
+            hovertemplate="%{y}, step %{x}: weight %{z:.2f}<extra></extra>",
+        )
+    )  # fmt: skip
+    figure.update_layout(
+        height=110 + 26 * len(names), margin={"l": 10, "r": 10, "t": 10, "b": 45}, template="simple_white"
+    )
+    figure.update_xaxes(title_text="step of the robust trajectory")
+    figure.update_yaxes(autorange="reversed", automargin=True)
+    return figure
+
+
+def dimensions_over_time(plan: Plan) -> go.Figure:
+    """Every action dimension over normalised time: candidates, robust mean, and the scale band."""
+    arms = plan.trajectory.num_arms
+    names = [
+        (f"arm {arm + 1} " if arms > 1 else "") + name
+        for arm in range(arms)
+        for name in (*(f"{d}, world [mm]" for d in DIMENSIONS), "gripper state (0 open, 1 closed)")
+    ]
+    rows = -(-len(names) // COLUMNS)
+    figure = make_subplots(
+        rows=rows, cols=COLUMNS, subplot_titles=names, vertical_spacing=0.28 / rows, horizontal_spacing=0.06
+    )
+    times = plan.trajectory.times
+    for dimension in range(len(names)):
+        unit = 1.0 if dimension % ACTION_DIM == STATE_INDEX else MM
+        place = {"row": dimension // COLUMNS + 1, "col": dimension % COLUMNS + 1}
+        first = dimension == 0
+        mean, scale = plan.trajectory.actions[:, dimension] * unit, plan.scale[:, dimension] * unit
+        if scale.any():
+            figure.add_scatter(
+                x=np.concatenate([times, times[::-1]]),
+                y=np.concatenate([mean + scale, (mean - scale)[::-1]]),
+                fill="toself",
+                fillcolor="rgba(0,0,0,0.13)",
+                line={"width": 0},
+                hoverinfo="skip",
+                name="robust mean ± scale",
+                legendgroup="band",
+                showlegend=first,
+                **place,
+            )
+        for index, candidate in enumerate(plan.candidates):
+            dash = "dot" if plan.hallucinated[index] else "solid"
+            figure.add_scatter(
+                x=candidate.times,
+                y=candidate.actions[:, dimension] * unit,
+                mode="lines",
+                line={"color": candidate_colour(plan, index), "width": 1.6, "dash": dash},
+                name=candidate_name(plan, index),
+                legendgroup=str(index),
+                showlegend=first,
+                **place,
+            )
+        figure.add_scatter(
+            x=times,
+            y=mean,
+            mode="lines",
+            line={"color": ROBUST_COLOUR, "width": 2.6},
+            name="robust mean",
+            legendgroup="mean",
+            showlegend=first,
+            **place,
+        )
+        figure.update_xaxes(title_text="normalised time" if place["row"] == rows else None, **place)
+    figure.update_layout(
+        height=210 * rows + 60,
+        margin={"l": 40, "r": 10, "t": 70, "b": 40},
+        template="simple_white",
+        legend={"orientation": "h", "y": 1 + 0.22 / rows, "yanchor": "bottom"},
+    )
+    figure.update_annotations(font_size=13)
+    return figure
