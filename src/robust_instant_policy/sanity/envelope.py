@@ -136,13 +136,13 @@ class Envelope:
         sides = triangle_sides(points)
         off = np.abs(sides - self.sides[arm]) - (SIDE_FACTOR * self.sides[arm] + SIDE_MARGIN_M)
         if off.max() > 0:
-            step, side = np.unravel_index(int(off.argmax()), off.shape)
+            step, side = (int(i) for i in np.unravel_index(int(off.argmax()), off.shape))
             value, usual = sides[step, side], self.sides[arm, side]
             what = "between the fingertips" if side == 0 else "between palm and fingertip"
             words = (
                 f"{name}the gripper is {value * 1e3:.0f} mm {what} at step {step}, {usual * 1e3:.0f} mm demonstrated"
             )
-            found.append(_outside("gripper shape", words, value, usual, int(step)))
+            found.append(_outside("gripper shape", words, value, usual, step))
         total = step_lengths(trajectory)[:, arm].sum()
         if total > self.length[arm]:
             words = f"{name}the path is {total:.2f} m long"

@@ -9,7 +9,7 @@ import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.sanity.envelope import gripper_changes, triangle_sides
-from robust_instant_policy.sanity.finding import Finding
+from robust_instant_policy.sanity.finding import Finding, Severity
 
 STATE_TOLERANCE = 1e-3  # of a gripper state around 0 and 1
 MIN_STEPS = 2
@@ -60,7 +60,7 @@ def _lengths(demonstrations: Sequence[Demonstration]) -> list[Finding]:
     if len(long := np.flatnonzero(steps > LONGER_WARNING * usual)):
         worst = int(steps[long].max())
         words = f"{_these(long)} is {worst / usual:.0f} times as long as the others ({worst} steps against {usual:.0f})"
-        severity = "error" if worst > LONGER_ERROR * usual else "warning"
+        severity: Severity = "error" if worst > LONGER_ERROR * usual else "warning"
         numbers = {"steps": worst, "median_steps": usual}
         found.append(Finding("length", severity, f"{words}; remove it, or record all at one rate", numbers))
     brief = np.flatnonzero((steps < SHORTER_WARNING * usual) & (steps >= MIN_STEPS))

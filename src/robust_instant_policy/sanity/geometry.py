@@ -21,6 +21,7 @@ from robust_instant_policy.sanity.hypotheses import ALL, DISPLACED, Hypothesis
 from robust_instant_policy.sanity.view import View, coarse
 
 TOUCH_M = 0.03  # gap below which a path, or a closing gripper, touches a surface: fingers beside a thin thing
+TOUCH_DEVIATIONS = 4.0  # of the depth's noise, added to that
 BELOW_TABLE_M = 0.015  # that a fingertip may lie below the table's plane: fingers press on tables
 BURIED_M = 0.03  # that a palm may lie behind a surface of the start image
 MIN_SHARE = 0.5  # of the demonstrations that must agree with their images
@@ -78,6 +79,11 @@ def _near(gaps: FloatArray) -> float:
     return float(np.clip(1 - gaps / FAR_M, 0, 1).mean()) if len(gaps) else 0.0
 
 
+def touch_distance(view: View) -> float:
+    """Gap below which a path touches what ``view`` shows, metres; noise hides thin things."""
+    return TOUCH_M + TOUCH_DEVIATIONS * view.noise
+
+
 def fits(contact: Contact, noise: float) -> bool:
     """Whether a path stays above the table and outside of what the image shows."""
     return contact.lowest > -(BELOW_TABLE_M + 2 * noise) and contact.buried < BURIED_M
@@ -86,13 +92,13 @@ def fits(contact: Contact, noise: float) -> bool:
 def evidence(views: Sequence[View], paths: Sequence[Path], poses: Sequence[FloatArray]) -> Evidence:
     """Of ``views``, and the `Path` and tool poses that belong to each."""
     contacts = tuple(contact(view, path) for view, path in zip(views, paths, strict=True))
-    closings = np.concatenate([c.grasps for c in contacts])
-    # A path that meets only what is flat on the table still meets a surface where a gripper closes on it.
+    reach = [touch_distance(view) for view in views]
+    closings = np.concatenate([c.grasps < near for c, near in zip(contacts, reach, strict=True)])
     return Evidence(
         contacts=contacts,
         surroundings=consistency([surroundings(view, pose) for view, pose in zip(views, poses, strict=True)]),
-        touching=float(np.mean([c.path < TOUCH_M for c in contacts])),
-        grasping=float((closings < TOUCH_M).mean()) if len(closings) else 0.0,
+        touching=float(np.mean([c.path < near for c, near in zip(contacts, reach, strict=True)])),
+        grasping=float(closings.mean()) if len(closings) else 0.0,
         clear=float(np.mean([fits(c, view.noise) for c, view in zip(contacts, views, strict=True)])),
         level=float(np.mean([view.share_on_plane * (view.camera_height > 0) for view in views])),
     )

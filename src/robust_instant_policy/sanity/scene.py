@@ -19,7 +19,8 @@ SURE_TEXTURE = 0.95  # of it, below which an image may be turned round
 CALIBRATION_M, CALIBRATION_RAD = 0.01, np.deg2rad(1.0)  # that a pose may change where the picture does not
 CALIBRATION_K = 0.03  # and the intrinsics, relatively
 TABLE_M, TABLE_RAD = 0.02, np.deg2rad(2.0)  # that the table may differ from the demonstrations'
-PEAK = 0.2  # correlation from which a displaced picture is recognised
+RESTORED = 0.6  # of the demonstrations' own correlation, that a displacement must restore
+MOVED_CLEARER = 0.1  # and by which it must be better than without
 CLEARER = 0.05  # by which a correlation or share must be better to explain a picture
 MIN_PLANE = 0.4
 
@@ -36,7 +37,7 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
     if not np.isfinite(like.depth):
         return [Finding("scenery", "unchecked", "too little of the scenery is visible to compare it")]
     same_depth = like.depth >= SAME_PICTURE * scenery.agreed
-    moved = _shifted(view, scenery) if scenery.textured and change.same else None
+    moved = _shifted(view, scenery, like) if scenery.textured and change.same else None
     turned = _turned(view, scenery, like, same_depth) if change.same else None
     same_texture = not scenery.textured or like.texture >= SAME_TEXTURE * scenery.texture
     numbers = {
@@ -135,10 +136,11 @@ def _turned(view: View, scenery: Scenery, like: Likeness, same_depth: bool) -> t
     return None
 
 
-def _shifted(view: View, scenery: Scenery) -> tuple[int, int] | None:
+def _shifted(view: View, scenery: Scenery, like: Likeness) -> tuple[int, int] | None:
     """By how many columns and rows the picture is displaced, None where its texture fits best as it is."""
-    cols, rows, peak, here = scenery.shift(view)
-    return (cols, rows) if (cols or rows) and peak >= PEAK and peak > here + CLEARER else None
+    cols, rows, there = scenery.shift(view)
+    restored = there > max(RESTORED * scenery.texture, like.texture + MOVED_CLEARER)
+    return (cols, rows) if (cols or rows) and restored else None
 
 
 def check_table(view: View, plane: FloatArray, centre: FloatArray) -> list[Finding]:

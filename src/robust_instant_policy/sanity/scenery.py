@@ -21,6 +21,7 @@ DEPTH_M = 0.006  # and at least this
 STATIC = 0.8  # share of the images that must agree on a pixel for it to be scenery
 DETAIL_PX = 3.0  # texture is what remains of the brightness without what is smoother than this
 MIN_TEXTURE = 0.35  # correlation of the demonstrations' own texture below which colour decides nothing
+COLOUR_CHANGE = 20.0  # of 255, from one image to the next, that is no change
 MIN_PIXELS = 50  # fewer say nothing
 BRIGHTNESS_NOISE = 1.0  # of 255
 
@@ -88,7 +89,8 @@ class Likeness:
 class Scenery:
     """The static background of images from one fixed camera, on the grid of `View`.
 
-    ``depth (h, w)`` metres and ``rgb (h, w, 3)``: medians over the images; ``static (h, w)`` bool. ``texture`` and
+    ``depth (h, w)`` metres and ``rgb (h, w, 3)``: medians over the images; ``static (h, w)`` bool,
+    ``steady (h, w)`` where colour stays the same, too. ``texture`` and
     ``agreed`` are the lowest `Likeness` of the images themselves, what a sound image has at least.
     """
 
@@ -96,6 +98,7 @@ class Scenery:
     depth: FloatArray
     rgb: NDArray[np.float32]
     static: NDArray[np.bool_]
+    steady: NDArray[np.bool_]
     texture: float
     agreed: float
 
@@ -112,12 +115,15 @@ class Scenery:
         fixed = (np.abs(depths - depth) < tolerance).mean(axis=0) >= STATIC
         static = fixed & ((agree.mean(axis=0) >= STATIC) | (np.stack([v.raised for v in views]).mean(axis=0) >= STATIC))
         rgb = np.median(np.stack([view.rgb for view in views]), axis=0).astype(np.float32)
-        bare = cls(views[0].observation, depth, rgb, static, float("nan"), 1.0)
+        # shadows and flat things move with the objects
+        change = np.abs(np.stack([view.rgb for view in views]) - rgb).max(axis=-1)
+        steady = static & ((change < COLOUR_CHANGE).mean(axis=0) >= STATIC)
+        bare = cls(views[0].observation, depth, rgb, static, steady, float("nan"), 1.0)
         if len(views) < 3:  # a median of two is neither
             return bare
         own = [bare.likeness(view) for view in views]
         texture = float(np.nanmin(values)) if np.isfinite(values := [o.texture for o in own]).any() else float("nan")
-        return cls(views[0].observation, depth, rgb, static, texture, min(o.depth for o in own))
+        return cls(views[0].observation, depth, rgb, static, steady, texture, min(o.depth for o in own))
 
     @property
     def textured(self) -> bool:
@@ -135,20 +141,25 @@ class Scenery:
         old, new = self.depth[clear], view.depth[clear]
         return Likeness(
             float((np.abs(new - old) < tolerance[clear]).mean()),
-            correlation(detail(self.rgb), detail(view.rgb), clear),
+            correlation(detail(self.rgb), detail(view.rgb), clear & self.steady),
             float(np.median(new / old)),
             float(np.median(new - old)),
         )
 
-    def shift(self, view: View) -> tuple[int, int, float, float]:
-        """The displacement (columns, rows, in full pixels) at which the texture of ``view`` fits best, the correlation
-        there, and that without displacement."""
+    def shift(self, view: View) -> tuple[int, int, float]:
+        """The displacement (columns, rows, in full pixels) at which the texture of ``view`` fits best, and the
+        correlation of the scenery's texture there."""
         a, b = detail(self.rgb), detail(view.rgb)
         a, b = (np.clip(v, *np.percentile(v, [1, 99])) for v in (a, b))
-        a, b = np.where(self.static, a, 0), np.where(view.raised, 0, b)
+        a, b = np.where(self.steady, a, 0), np.where(view.raised, 0, b)
         spectrum = np.fft.rfft2(a).conj() * np.fft.rfft2(b)
         peaks = np.fft.irfft2(spectrum, s=a.shape) / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-9)
         row, col = np.unravel_index(int(peaks.argmax()), peaks.shape)
         height, width = a.shape
         rows, cols = (int(row) + height // 2) % height - height // 2, (int(col) + width // 2) % width - width // 2
-        return cols * view.every, rows * view.every, float(peaks.max()), float(peaks[0, 0])
+        back = np.roll(detail(view.rgb), (-rows, -cols), (0, 1))
+        clear = self.steady & ~np.roll(view.raised, (-rows, -cols), (0, 1))
+        margin_rows, margin_cols = abs(rows) + 1, abs(cols) + 1  # what was rolled round is not the picture
+        inner = np.zeros_like(clear)
+        inner[margin_rows:-margin_rows, margin_cols:-margin_cols] = True
+        return cols * view.every, rows * view.every, correlation(detail(self.rgb), back, clear & inner)
