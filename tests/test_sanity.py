@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.faults import FAULTS
+from benchmarks.faults import FAULTS, points
+from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import load_demonstrations
@@ -36,6 +37,11 @@ def scene(workbench):
 @pytest.fixture(scope="module")
 def report(demonstrations):
     return check_demonstrations(demonstrations)
+
+
+def yaw(index):
+    """A turn about the vertical, another for every demonstration."""
+    return Rotation.from_euler("z", 25.0 * index, degrees=True).as_matrix()
 
 
 def told(findings):
@@ -81,6 +87,17 @@ def test_trajectories_shuffled_against_their_images_are_refused(demonstrations):
     assert "other images" in told(found)
 
 
+def test_quaternions_read_in_the_wrong_order_are_named(demonstrations):
+    turned = [
+        points(
+            lambda p, i=i: (p - p[..., 1:, :].mean(-2, keepdims=True)) @ yaw(i) + p[..., 1:, :].mean(-2, keepdims=True)
+        )([demonstration])[0]
+        for i, demonstration in enumerate(demonstrations)
+    ]
+    with pytest.raises(GeometryError, match="quaternion"):
+        check_demonstrations(FAULTS["quaternion-order:demos"].demonstrations(turned)).raise_if_wrong()
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
@@ -97,6 +114,8 @@ def test_trajectories_shuffled_against_their_images_are_refused(demonstrations):
         ("lowered:scene", "camera"),
         ("no-depth:scene", "depth"),
         ("black:scene", "colour"),
+        ("bgr:scene", "red and blue are exchanged"),
+        ("depth-other-lens:scene", "another lens"),
     ],
 )
 def test_a_scene_that_contradicts_the_demonstrations_is_refused_and_the_mistake_is_named(

@@ -29,8 +29,10 @@ FAR_M = 0.06  # gap from which a path does not touch at all, when hypotheses are
 REPEATED = 1.5  # weight of consistency beside those shares
 BETTER = 0.45  # by which the sum of the shares of a hypothesis must exceed that of the data as they are
 CONSISTENT = 0.42  # score from which surroundings repeat; the ten simulated tasks have 0.50 to 0.98
+LESS_LEVEL = 0.05  # by which the share of readings on the table may be lower under a hypothesis
 COARSE_PX = 112  # longer edge of the grid on which hypotheses are compared
 TESTED = 6  # demonstrations on which hypotheses are compared
+PAIRED = 20  # demonstrations among which images are exchanged
 PAIRINGS = 6  # wrong pairings of images and paths that the right one is compared with
 
 
@@ -86,7 +88,8 @@ def touch_distance(view: View) -> float:
 
 def fits(contact: Contact, noise: float) -> bool:
     """Whether a path stays above the table and outside of what the image shows."""
-    return contact.lowest > -(BELOW_TABLE_M + 2 * noise) and contact.buried < BURIED_M
+    lowest = min(contact.lowest, contact.lowest_palm)
+    return lowest > -(BELOW_TABLE_M + 2 * noise) and contact.buried < BURIED_M
 
 
 def evidence(views: Sequence[View], paths: Sequence[Path], poses: Sequence[FloatArray]) -> Evidence:
@@ -129,18 +132,22 @@ def explain(
 
     today = under(None)
     found = [Explanation(h.cause, h.remedy, under(h)) for h in ALL]
-    found += _other_pairing([View.of(o, repaired=True) for o in some], own_paths, own_poses)
-    best = max(found, key=lambda e: e.evidence.total)
+    found += _other_pairing(demonstrations[:PAIRED], paths[:PAIRED], poses[:PAIRED])
+    found = [e for e in found if e.evidence.level > today.level - LESS_LEVEL]
+    best = max(found, key=lambda e: e.evidence.total, default=Explanation("", "", today))
     if best.evidence.total <= today.total + BETTER:  # no known mistake: is the camera beside where it should be?
         best = max((Explanation(h.cause, h.remedy, under(h), True) for h in DISPLACED), key=lambda e: e.evidence.total)
     clear = best.evidence.touching >= 0.7 or best.evidence.grasping >= 0.7
     return best if clear and best.evidence.total > today.total + BETTER else None
 
 
-def _other_pairing(views: Sequence[View], paths: Sequence[Path], poses: Sequence[FloatArray]) -> list[Explanation]:
+def _other_pairing(
+    demonstrations: Sequence[Demonstration], paths: Sequence[Path], poses: Sequence[FloatArray]
+) -> list[Explanation]:
     """The assignment of images to paths with the smallest gaps, where it is not the given one."""
-    if len(views) < MIN_DEMONSTRATIONS:
+    if len(demonstrations) < MIN_DEMONSTRATIONS:
         return []
+    views = [View.of(coarse(d.observation, COARSE_PX), repaired=True) for d in demonstrations]
     costs = np.array([[_gap(contact(view, path)) for view in views] for path in paths])
     _, order = linear_sum_assignment(costs)
     moved = int((order != np.arange(len(order))).sum())
@@ -163,7 +170,7 @@ def pairing_scores(views: Sequence[View], poses: Sequence[FloatArray]) -> tuple[
     """Consistency of images with their own paths, and the mean over cyclic wrong pairings."""
     count = len(views)
     own = consistency([surroundings(v, p) for v, p in zip(views, poses, strict=True)]).score
-    shifts = np.unique(np.round(np.linspace(1, count - 1, PAIRINGS)).astype(int)) if count > 1 else []
+    shifts = sorted({round(shift) for shift in np.linspace(1, count - 1, PAIRINGS)}) if count > 1 else []
     wrong = [
         consistency([surroundings(views[(i + shift) % count], pose) for i, pose in enumerate(poses)]).score
         for shift in shifts

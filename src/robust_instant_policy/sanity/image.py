@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from robust_instant_policy.pointcloud import MILLIMETRES_ABOVE
-from robust_instant_policy.sanity.finding import Finding
+from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.view import View
 
 MIN_READINGS = 0.05  # share of the pixels that must have a steady depth
@@ -53,7 +53,7 @@ def check_image(view: View) -> list[Finding]:
         found.append(Finding("camera pose", "error", words, {"camera_height": view.camera_height}))
     elif view.share_on_plane >= MIN_PLANE and view.tilt > TILT_WARNING_RAD:
         words = f"the table is tilted by {np.rad2deg(view.tilt):.1f} degrees in the world, whose z axis must point up"
-        severity = "error" if view.tilt > TILT_ERROR_RAD else "warning"
+        severity: Severity = "error" if view.tilt > TILT_ERROR_RAD else "warning"
         advice = "; the camera's pose is turned, or the depth is wrong"
         found.append(Finding("table", severity, words + advice, {"tilt": view.tilt}, "camera turned"))
     return found

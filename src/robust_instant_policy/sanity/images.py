@@ -10,9 +10,9 @@ from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.agreement import CLEARLY, Agreement, exchanged
 from robust_instant_policy.sanity.consistency import MIN_DEMONSTRATIONS
-from robust_instant_policy.sanity.contact import Path
+from robust_instant_policy.sanity.contact import Path, gaps
 from robust_instant_policy.sanity.envelope import approaches
-from robust_instant_policy.sanity.finding import Finding
+from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.geometry import (
     CONSISTENT,
     MIN_SHARE,
@@ -22,6 +22,7 @@ from robust_instant_policy.sanity.geometry import (
     explain,
     fits,
     pairing_scores,
+    touch_distance,
 )
 from robust_instant_policy.sanity.hypotheses import reordered_quaternions
 from robust_instant_policy.sanity.image import check_image
@@ -29,17 +30,22 @@ from robust_instant_policy.sanity.view import View
 
 PAIRED = 0.12  # by which the own images' consistency must exceed that of other images
 CLOSE_M = 0.015  # gap from which a path is compared with other hypotheses, too
+LOWEST_PALM_M = 0.02  # above the table
+MOSTLY = 0.8  # share of the demonstrations
 ONE_SCENE_M = 0.01  # spread of the objects below which all demonstrations show one scene
 UNLIKE = 0.25  # likeness below which a demonstration contradicts the others,
 ALIKE = 0.6  # where their median is at least this
 FAR_FROM_ALL_M = 0.06  # gap of a path that alone touches nothing
 LESS_CONSISTENT = 0.05  # by which the consistency under a hypothesis may be lower
-STRAIGHT_RAD, CROOKED_RAD = np.deg2rad(1.0), np.deg2rad(5.0)  # spread of the approach with quaternions in order, or not
+STRAIGHT_RAD, CROOKED_RAD = (
+    np.deg2rad(3.5),
+    np.deg2rad(10.0),
+)  # spread of the approach with quaternions in order, or not
 
 
 def check_each_image(views: Sequence[View]) -> list[Finding]:
     """`check_image` of every view, the same finding told once."""
-    told: dict[tuple[str, str], list[tuple[int, Finding]]] = {}
+    told: dict[tuple[str, Severity], list[tuple[int, Finding]]] = {}
     for index, view in enumerate(views):
         for finding in check_image(view):
             told.setdefault((finding.kind, finding.severity), []).append((index, finding))
@@ -80,13 +86,14 @@ def check_contact(
     if explanation:
         words = f"{_measured(today)}; {_explained(explanation)}"
         # where the images do fit as they are, a small displacement that fits better still proves nothing
-        severity = "warning" if right and explanation.displaced else "error"
+        severity: Severity = "warning" if right and explanation.displaced else "error"
         return [Finding("contact", severity, words, numbers, explanation.cause)]
     if right:
         return _outliers(views, today)
     if not any(view.raised.any() for view in views) and today.clear >= MIN_SHARE:
         words = "nothing in the images stands above the table: whether images and paths belong together was not checked"
-        return [Finding("contact", "unchecked", words, numbers)]
+        closes = any(len(c.grasps) for c in today.contacts)
+        return [Finding("contact", "warning" if closes else "unchecked", words, numbers, "flat depth: nothing raised")]
     if today.clear < MIN_SHARE:
         advice = "; check the camera's pose, the depth unit and the tool's offset"
         return [Finding("contact", "error", _measured(today) + advice, numbers)]
@@ -135,6 +142,33 @@ def _explained(explanation: Explanation) -> str:
     return f"{words}: {explanation.remedy}"
 
 
+def check_palms(today: Evidence) -> list[Finding]:
+    """A palm that touches the table belongs to a tool frame whose axes or offset are wrong."""
+    lowest = float(np.median([c.lowest_palm for c in today.contacts]))
+    if lowest > LOWEST_PALM_M:
+        return []
+    words = f"the palm comes within {lowest * 1e3:.0f} mm of the table: the gripper lies on its side or upside down"
+    advice = "; check the tool frame (z out of the gripper) and the order of quaternions"
+    return [Finding("rotation", "warning", words + advice, {"lowest_palm": lowest}, "tool frame")]
+
+
+def check_openings(demonstrations: Sequence[Demonstration], views: Sequence[View]) -> list[Finding]:
+    """Grippers that begin closed and open where there is something to grasp may have their states inverted."""
+    inverted = 0
+    for demonstration, view in zip(demonstrations, views, strict=True):
+        closed = demonstration.trajectory.gripper_state[:, 0] > 0.5
+        if not closed[0] or closed.all():
+            continue
+        first = int((~closed).argmax())
+        middle = demonstration.trajectory.triplets[first, 0, 1:].mean(axis=0)
+        inverted += bool(gaps(view, middle[None])[0] < touch_distance(view))
+    if inverted < MOSTLY * len(views):
+        return []
+    words = f"in {inverted} of {len(views)} demonstrations the gripper begins closed and opens at a surface"
+    advice = ": are its states inverted? 0 is open, 1 is closed"
+    return [Finding("gripper state", "warning", words + advice, {"inverted": float(inverted)}, "states inverted")]
+
+
 def _outliers(views: Sequence[View], today: Evidence) -> list[Finding]:
     """Single demonstrations whose path does not fit their image while the others' do."""
     if len(views) < MIN_DEMONSTRATIONS + 1:
@@ -152,7 +186,7 @@ def _outliers(views: Sequence[View], today: Evidence) -> list[Finding]:
             f"its lowest fingertip is {c.lowest * 1e3:.0f} mm above the table, and it is {likeness[index]:.2f} like "
             f"the others ({usual:.2f}); look at it, and remove it if it is wrong"
         )
-        severity = "error" if apart or not fits(c, view.noise) else "warning"
+        severity: Severity = "error" if apart or not fits(c, view.noise) else "warning"
         numbers = {"demonstration": float(index), "path_gap": c.path, "likeness": float(likeness[index])}
         found.append(Finding("contradiction", severity, words, numbers, f"demonstration {index}"))
     return found

@@ -15,7 +15,7 @@ from robust_instant_policy.sanity.consistency import gripper_poses
 from robust_instant_policy.sanity.contact import Path
 from robust_instant_policy.sanity.envelope import Envelope
 from robust_instant_policy.sanity.episodes import check_episodes
-from robust_instant_policy.sanity.finding import DemonstrationError, Finding, GeometryError, errors
+from robust_instant_policy.sanity.finding import DemonstrationError, Finding, GeometryError, Severity, errors
 from robust_instant_policy.sanity.geometry import Evidence, evidence
 from robust_instant_policy.sanity.image import check_image
 from robust_instant_policy.sanity.images import (
@@ -23,6 +23,8 @@ from robust_instant_policy.sanity.images import (
     check_agreement,
     check_contact,
     check_each_image,
+    check_openings,
+    check_palms,
     check_quaternions,
     object_centre,
     scene_spread,
@@ -131,6 +133,7 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
     found += cameras
     found += check_contact(demonstrations, views, paths, poses, today)
     edges = [agreement(view) for view in views]
+    found += check_palms(today) + check_openings(demonstrations, views)
     found += check_agreement(views, edges)
     spread = scene_spread(views)
     if len(views) > 1 and np.isfinite(spread) and spread < ONE_SCENE_M:
@@ -172,7 +175,7 @@ def _check_cameras(views: Sequence[View]) -> list[Finding]:
     if same.all():
         return _check_planes(views)
     scenery = Scenery.of([view for view, is_same in zip(views, same, strict=True) if is_same])
-    for index in np.flatnonzero(~same):
+    for index in (int(i) for i in np.flatnonzero(~same)):
         change = changes[index]
         small = change.moved < CALIBRATION_M and change.turned < CALIBRATION_RAD and change.intrinsics < CALIBRATION_K
         like = scenery.likeness(views[index])
@@ -224,7 +227,7 @@ def _check_novelty(view: View, known: Reference) -> list[Finding]:
         return []
     if not np.isfinite(centre).all():
         words = "nothing in the image stands above the table; every demonstration shows something that does"
-        severity = "error" if len(seen) == len(known.object_centres) else "warning"
+        severity: Severity = "error" if len(seen) == len(known.object_centres) else "warning"
         return [Finding("scene", severity, words, cause="flat depth: nothing raised")]
     distance = float(np.linalg.norm(seen - centre, axis=1).min())
     spread = known.scene_spread_m if np.isfinite(known.scene_spread_m) else 0.0

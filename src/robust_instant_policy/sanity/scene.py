@@ -22,6 +22,7 @@ TABLE_M, TABLE_RAD = 0.02, np.deg2rad(2.0)  # that the table may differ from the
 RESTORED = 0.6  # of the demonstrations' own correlation, that a displacement must restore
 MOVED_CLEARER = 0.1  # and by which it must be better than without
 CLEARER = 0.05  # by which a correlation or share must be better to explain a picture
+MISSING = 0.2  # share of the scenery without depth that no camera noise explains
 MIN_PLANE = 0.4
 
 
@@ -36,6 +37,15 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
     like = scenery.likeness(view)
     if not np.isfinite(like.depth):
         return [Finding("scenery", "unchecked", "too little of the scenery is visible to compare it")]
+    found = []
+    missing = float(np.isnan(view.depth)[scenery.static].mean())
+    if missing > MISSING:
+        words = f"depth is missing in {missing:.0%} of the scenery that the demonstrations' images have"
+        advice = "; is it of another lens or stream, or not aligned to colour?"
+        found.append(Finding("scenery", "error", words + advice, {"missing": missing}, "depth of another lens"))
+    if change.same and scenery.swapped(view):
+        words = "red and blue are exchanged: the image is BGR, the demonstrations' are RGB, or the other way round"
+        found.append(Finding("scenery", "error", words, cause="BGR"))
     same_depth = like.depth >= SAME_PICTURE * scenery.agreed
     moved = _shifted(view, scenery, like) if scenery.textured and change.same else None
     turned = _turned(view, scenery, like, same_depth) if change.same else None
@@ -50,13 +60,13 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
     if same_depth and same_texture and not moved and not turned:
         small = change.moved < CALIBRATION_M and change.turned < CALIBRATION_RAD and change.intrinsics < CALIBRATION_K
         if small:
-            return []
+            return found
         cause = _name_calibration(scenery.reference, observation, change)
         words = f"the picture is the demonstrations', but its camera is said to be {change}"
-        return [Finding("camera", "error", f"{words}: {cause}", numbers, cause)]
+        return [*found, Finding("camera", "error", f"{words}: {cause}", numbers, cause)]
     if change.same:
-        return [_picture_changed(view, scenery, like, same_depth, moved, turned, numbers)]
-    return []  # another camera, or one that was moved and calibrated: only the world can be compared
+        return [*found, _picture_changed(view, scenery, like, same_depth, moved, turned, numbers)]
+    return found  # another camera, or one that was moved and calibrated: only the world can be compared
 
 
 def _name_calibration(old: Observation, new: Observation, change: CameraChange) -> str:

@@ -21,6 +21,8 @@ DEPTH_M = 0.006  # and at least this
 STATIC = 0.8  # share of the images that must agree on a pixel for it to be scenery
 DETAIL_PX = 3.0  # texture is what remains of the brightness without what is smoother than this
 MIN_TEXTURE = 0.35  # correlation of the demonstrations' own texture below which colour decides nothing
+EXCHANGED = 2.0  # times nearer that colours must be with channels exchanged, and
+COLOUR_NOISE = 3.0  # of 255 beyond that
 COLOUR_CHANGE = 20.0  # of 255, from one image to the next, that is no change
 MIN_PIXELS = 50  # fewer say nothing
 BRIGHTNESS_NOISE = 1.0  # of 255
@@ -145,6 +147,15 @@ class Scenery:
             float(np.median(new / old)),
             float(np.median(new - old)),
         )
+
+    def swapped(self, view: View) -> bool:
+        """Whether the colours of ``view`` are the scenery's with red and blue exchanged."""
+        clear = self.steady & ~view.raised
+        if view.rgb.shape != self.rgb.shape or clear.sum() < MIN_PIXELS:
+            return False
+        old, new = self.rgb[clear], view.rgb[clear]
+        as_is, exchanged = (float(np.abs(old - other).mean()) for other in (new, new[:, ::-1]))
+        return as_is > EXCHANGED * exchanged + COLOUR_NOISE
 
     def shift(self, view: View) -> tuple[int, int, float]:
         """The displacement (columns, rows, in full pixels) at which the texture of ``view`` fits best, and the
