@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -39,9 +40,10 @@ def report(demonstrations):
     return check_demonstrations(demonstrations)
 
 
-def yaw(index):
-    """A turn about the vertical, another for every demonstration."""
-    return Rotation.from_euler("z", 25.0 * index, degrees=True).as_matrix()
+def about_its_middle(turn, triplets):
+    """Grippers turned about the middle of their fingertips."""
+    middle = triplets[..., 1:, :].mean(axis=-2, keepdims=True)
+    return (triplets - middle) @ turn.T + middle
 
 
 def told(findings):
@@ -88,12 +90,10 @@ def test_trajectories_shuffled_against_their_images_are_refused(demonstrations):
 
 
 def test_quaternions_read_in_the_wrong_order_are_named(demonstrations):
-    turned = [
-        points(
-            lambda p, i=i: (p - p[..., 1:, :].mean(-2, keepdims=True)) @ yaw(i) + p[..., 1:, :].mean(-2, keepdims=True)
-        )([demonstration])[0]
-        for i, demonstration in enumerate(demonstrations)
-    ]
+    turned = []
+    for index, demonstration in enumerate(demonstrations):
+        turn = Rotation.from_euler("z", 25.0 * index, degrees=True).as_matrix()
+        turned += points(partial(about_its_middle, turn))([demonstration])
     with pytest.raises(GeometryError, match="quaternion"):
         check_demonstrations(FAULTS["quaternion-order:demos"].demonstrations(turned)).raise_if_wrong()
 
