@@ -125,6 +125,20 @@ def test_a_scene_that_contradicts_the_demonstrations_is_refused_and_the_mistake_
         report.require_observation(FAULTS[fault].scene(scene, demonstrations))
 
 
+def test_another_camera_is_no_error_where_its_calibration_is_right(report, scene):
+    margin = scene.rgb.shape[0] // 8
+    cut = slice(margin, None), slice(2 * margin, None)  # the part of the image that a camera beside it would see
+    shift = np.array([[0, 0, 2 * margin], [0, 0, margin], [0, 0, 0]])
+    index = np.clip(np.arange(scene.rgb.shape[0]) + margin, 0, scene.rgb.shape[0] - 1)
+    across = np.clip(np.arange(scene.rgb.shape[1]) + 2 * margin, 0, scene.rgb.shape[1] - 1)
+    depth = np.full_like(scene.depth, np.nan)
+    depth[:-margin, : -2 * margin] = scene.depth[cut]
+    moved = replace(scene, rgb=scene.rgb[index][:, across], depth=depth, intrinsics=scene.intrinsics - shift)
+    findings = report.check_observation(moved)
+    assert not [finding for finding in errors(findings) if finding.kind != "scenery"]
+    assert not any("texture is another" in str(finding) for finding in findings)
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
     [

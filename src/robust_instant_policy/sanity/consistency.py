@@ -57,6 +57,19 @@ def surroundings(view: View, poses: FloatArray) -> FloatArray:
     return solid.reshape(points.shape[:-1]).astype(np.float64)
 
 
+def repetition(views: Sequence[View], poses: Sequence[FloatArray]) -> Consistency:
+    """How well what ``views`` show around the gripper at its ``poses`` (one ``(T, A, 4, 4)`` a view) repeats.
+
+    Round things are touched from any side: the gripper's own frame, or one with the first demonstration's axes at the
+    gripper's place, whichever repeats better.
+    """
+    common = [pose.copy() for pose in poses]
+    for pose in common:
+        pose[..., :3, :3] = poses[0][..., :3, :3]
+    both = (consistency([surroundings(v, p) for v, p in zip(views, some, strict=True)]) for some in (poses, common))
+    return max(both, key=lambda found: np.nan_to_num(found.score))
+
+
 def consistency(solid: Sequence[FloatArray]) -> Consistency:
     """How well ``solid``, the `surroundings` of each demonstration, repeat at the best moment of each arm.
 

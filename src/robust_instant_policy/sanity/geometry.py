@@ -13,8 +13,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.consistency import (
     MIN_DEMONSTRATIONS,
     Consistency,
-    consistency,
-    surroundings,
+    repetition,
 )
 from robust_instant_policy.sanity.contact import Contact, Path, contact
 from robust_instant_policy.sanity.hypotheses import ALL, DISPLACED, Hypothesis
@@ -29,6 +28,8 @@ FAR_M = 0.06  # gap from which a path does not touch at all, when hypotheses are
 REPEATED = 1.5  # weight of consistency beside those shares
 BETTER = 0.45  # by which the sum of the shares of a hypothesis must exceed that of the data as they are
 CONSISTENT = 0.42  # score from which surroundings repeat; the ten simulated tasks have 0.50 to 0.98
+EXPLAINED = 0.35  # consistency that a hypothesis must reach, and
+MOSTLY = 0.7  # share of the paths, or of the closing grippers, that must touch under it
 LESS_LEVEL = 0.05  # by which the share of readings on the table may be lower under a hypothesis
 COARSE_PX = 112  # longer edge of the grid on which hypotheses are compared
 TESTED = 6  # demonstrations on which hypotheses are compared
@@ -99,7 +100,7 @@ def evidence(views: Sequence[View], paths: Sequence[Path], poses: Sequence[Float
     closings = np.concatenate([c.grasps < near for c, near in zip(contacts, reach, strict=True)])
     return Evidence(
         contacts=contacts,
-        surroundings=consistency([surroundings(view, pose) for view, pose in zip(views, poses, strict=True)]),
+        surroundings=repetition(views, poses),
         touching=float(np.mean([c.path < near for c, near in zip(contacts, reach, strict=True)])),
         grasping=float(closings.mean()) if len(closings) else 0.0,
         clear=float(np.mean([fits(c, view.noise) for c, view in zip(contacts, views, strict=True)])),
@@ -109,8 +110,10 @@ def evidence(views: Sequence[View], paths: Sequence[Path], poses: Sequence[Float
 
 @dataclass(frozen=True)
 class Explanation:
-    """A hypothesis that fits, and the evidence with its correction applied; ``displaced``: a camera beside its place,
-    not a known mistake."""
+    """A hypothesis that fits, and the evidence with its correction applied.
+
+    ``displaced``: the camera beside its place, which is no known mistake and may fit by chance.
+    """
 
     cause: str
     remedy: str
@@ -136,8 +139,13 @@ def explain(
     found = [e for e in found if e.evidence.level > today.level - LESS_LEVEL]
     best = max(found, key=lambda e: e.evidence.total, default=Explanation("", "", today))
     if best.evidence.total <= today.total + BETTER:  # no known mistake: is the camera beside where it should be?
-        best = max((Explanation(h.cause, h.remedy, under(h), True) for h in DISPLACED), key=lambda e: e.evidence.total)
-    clear = best.evidence.touching >= 0.7 or best.evidence.grasping >= 0.7
+        best = max(
+            (Explanation(h.cause, h.remedy, under(h), displaced=True) for h in DISPLACED),
+            key=lambda e: e.evidence.total,
+        )
+    clear = best.evidence.touching >= MOSTLY or best.evidence.grasping >= MOSTLY
+    score = best.evidence.surroundings.score
+    clear = clear and (not np.isfinite(score) or score >= EXPLAINED)
     return best if clear and best.evidence.total > today.total + BETTER else None
 
 
@@ -169,10 +177,7 @@ def _gap(found: Contact) -> float:
 def pairing_scores(views: Sequence[View], poses: Sequence[FloatArray]) -> tuple[float, float]:
     """Consistency of images with their own paths, and the mean over cyclic wrong pairings."""
     count = len(views)
-    own = consistency([surroundings(v, p) for v, p in zip(views, poses, strict=True)]).score
+    own = repetition(views, poses).score
     shifts = sorted({round(shift) for shift in np.linspace(1, count - 1, PAIRINGS)}) if count > 1 else []
-    wrong = [
-        consistency([surroundings(views[(i + shift) % count], pose) for i, pose in enumerate(poses)]).score
-        for shift in shifts
-    ]
+    wrong = [repetition([views[(i + shift) % count] for i in range(count)], poses).score for shift in shifts]
     return own, float(np.mean(wrong)) if wrong else float("nan")

@@ -80,13 +80,14 @@ def check_contact(
         "touching": today.touching,
         "clear": today.clear,
     }
-    explanation = explain(demonstrations, paths, poses)
+    explanation = None if right and count <= MIN_DEMONSTRATIONS else explain(demonstrations, paths, poses)
     if explanation and right and explanation.evidence.surroundings.score < score - LESS_CONSISTENT:
         explanation = None  # nearer by chance: what it shows around the gripper repeats less
     if explanation:
         words = f"{_measured(today)}; {_explained(explanation)}"
-        # where the images do fit as they are, a small displacement that fits better still proves nothing
-        severity: Severity = "warning" if right and explanation.displaced else "error"
+        # where the images do fit as they are, a hypothesis that fits better proves nothing
+        meets = touches and today.clear >= MIN_SHARE
+        severity: Severity = "warning" if right or (meets and explanation.displaced) else "error"
         return [Finding("contact", severity, words, numbers, explanation.cause)]
     if right:
         return _outliers(views, today)

@@ -80,7 +80,7 @@ class SetReport:
     def raise_if_wrong(self) -> None:
         """Raises `GeometryError` or `DemonstrationError` with all errors among the findings in one line."""
         if found := errors(self.findings):
-            geometric = all(finding.kind in GEOMETRIC for finding in found)
+            geometric = any(finding.kind in GEOMETRIC for finding in found)
             raise (GeometryError if geometric else DemonstrationError)(found)
 
     def check_observation(self, observation: Observation) -> tuple[Finding, ...]:

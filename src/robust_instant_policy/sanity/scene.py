@@ -22,6 +22,8 @@ TABLE_M, TABLE_RAD = 0.02, np.deg2rad(2.0)  # that the table may differ from the
 RESTORED = 0.6  # of the demonstrations' own correlation, that a displacement must restore
 MOVED_CLEARER = 0.1  # and by which it must be better than without
 CLEARER = 0.05  # by which a correlation or share must be better to explain a picture
+MUCH_TEXTURE = 0.8  # from which texture survives another camera's resolution
+SAME_IN_WORLD = 0.3  # of the demonstrations' own correlation, of texture on the table seen by another camera
 MISSING = 0.2  # share of the scenery without depth that no camera noise explains
 MIN_PLANE = 0.4
 
@@ -34,6 +36,7 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
         old, new = scenery.reference.rgb.shape, observation.rgb.shape
         words = f"the image has {new[1]}x{new[0]} pixels, the demonstrations' have {old[1]}x{old[0]}"
         return [Finding("camera", "warning", f"{words}: scenery was not compared", cause="another resolution")]
+    small = change.moved < CALIBRATION_M and change.turned < CALIBRATION_RAD and change.intrinsics < CALIBRATION_K
     like = scenery.likeness(view)
     if not np.isfinite(like.depth):
         return [Finding("scenery", "unchecked", "too little of the scenery is visible to compare it")]
@@ -43,12 +46,12 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
         words = f"depth is missing in {missing:.0%} of the scenery that the demonstrations' images have"
         advice = "; is it of another lens or stream, or not aligned to colour?"
         found.append(Finding("scenery", "error", words + advice, {"missing": missing}, "depth of another lens"))
-    if change.same and scenery.swapped(view):
+    if small and scenery.swapped(view):
         words = "red and blue are exchanged: the image is BGR, the demonstrations' are RGB, or the other way round"
         found.append(Finding("scenery", "error", words, cause="BGR"))
     same_depth = like.depth >= SAME_PICTURE * scenery.agreed
-    moved = _shifted(view, scenery, like) if scenery.textured and change.same else None
-    turned = _turned(view, scenery, like, same_depth) if change.same else None
+    moved = _shifted(view, scenery, like) if scenery.textured and small else None
+    turned = _turned(view, scenery, like, same_depth) if small else None
     same_texture = not scenery.textured or like.texture >= SAME_TEXTURE * scenery.texture
     numbers = {
         "same_depth": like.depth,
@@ -58,15 +61,22 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
         "intrinsics": change.intrinsics,
     }
     if same_depth and same_texture and not moved and not turned:
-        small = change.moved < CALIBRATION_M and change.turned < CALIBRATION_RAD and change.intrinsics < CALIBRATION_K
         if small:
             return found
         cause = _name_calibration(scenery.reference, observation, change)
         words = f"the picture is the demonstrations', but its camera is said to be {change}"
         return [*found, Finding("camera", "error", f"{words}: {cause}", numbers, cause)]
-    if change.same:
+    if small:
         return [*found, _picture_changed(view, scenery, like, same_depth, moved, turned, numbers)]
-    return found  # another camera, or one that was moved and calibrated: only the world can be compared
+    # Another camera, or one that was moved and calibrated: only the world can be compared.
+    there = scenery.texture_in_world(view)
+    if scenery.texture >= MUCH_TEXTURE and there < SAME_IN_WORLD * scenery.texture:
+        words = f"the camera is {change}, and where its calibration puts the table the texture is another"
+        advice = f" ({there:.2f} against {scenery.texture:.2f}): is the new calibration right, and the table the same?"
+        found.append(
+            Finding("camera", "warning", words + advice, {**numbers, "texture_in_world": there}, "camera moved")
+        )
+    return found
 
 
 def _name_calibration(old: Observation, new: Observation, change: CameraChange) -> str:

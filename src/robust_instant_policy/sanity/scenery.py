@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.geometry import FloatArray, invert_pose
+from robust_instant_policy.geometry import FloatArray, invert_pose, project
 from robust_instant_policy.sanity.view import View
 
 SAME_PLACE_M = 0.003  # two camera poses nearer than this, and
@@ -147,6 +147,19 @@ class Scenery:
             float(np.median(new / old)),
             float(np.median(new - old)),
         )
+
+    def texture_in_world(self, view: View) -> float:
+        """Correlation of the texture that ``view`` and the scenery show at the same places of the table, wherever the
+        two cameras are; NaN where they share too little."""
+        flat = np.isfinite(view.depth) & ~view.raised
+        pixels = project(view.points[flat], self.reference.intrinsics, self.reference.camera_pose)
+        every = -(-max(self.reference.depth.shape) // max(self.depth.shape))
+        col, row = np.rint(pixels / every).astype(np.intp).T
+        height, width = self.depth.shape
+        inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+        inside[inside] = self.steady[row[inside], col[inside]]
+        old = detail(self.rgb)[row[inside], col[inside]]
+        return correlation(old, detail(view.rgb)[flat][inside], np.ones(len(old), dtype=bool))
 
     def swapped(self, view: View) -> bool:
         """Whether the colours of ``view`` are the scenery's with red and blue exchanged."""
