@@ -87,10 +87,11 @@ def touch_distance(view: View) -> float:
     return TOUCH_M + TOUCH_DEVIATIONS * view.noise
 
 
-def fits(contact: Contact, noise: float) -> bool:
+def fits(contact: Contact, view: View) -> bool:
     """Whether a path stays above the table and outside of what the image shows."""
     lowest = min(contact.lowest, contact.lowest_palm)
-    return lowest > -(BELOW_TABLE_M + 2 * noise) and contact.buried < BURIED_M
+    above = lowest > -(BELOW_TABLE_M + 2 * view.noise) or not view.is_support
+    return above and contact.buried < BURIED_M
 
 
 def evidence(views: Sequence[View], paths: Sequence[Path], poses: Sequence[FloatArray]) -> Evidence:
@@ -103,7 +104,7 @@ def evidence(views: Sequence[View], paths: Sequence[Path], poses: Sequence[Float
         surroundings=repetition(views, poses),
         touching=float(np.mean([c.path < near for c, near in zip(contacts, reach, strict=True)])),
         grasping=float(closings.mean()) if len(closings) else 0.0,
-        clear=float(np.mean([fits(c, view.noise) for c, view in zip(contacts, views, strict=True)])),
+        clear=float(np.mean([fits(c, view) for c, view in zip(contacts, views, strict=True)])),
         level=float(np.mean([view.share_on_plane * (view.camera_height > 0) for view in views])),
     )
 

@@ -180,14 +180,14 @@ def _outliers(views: Sequence[View], today: Evidence) -> list[Finding]:
     for index, (c, view) in enumerate(zip(today.contacts, views, strict=True)):
         unlike = usual >= ALIKE and likeness[index] < UNLIKE
         apart = c.path > FAR_FROM_ALL_M and today.touching > 1 - MIN_SHARE
-        if not (unlike or apart or not fits(c, view.noise)):
+        if not (unlike or apart or not fits(c, view)):
             continue
         words = (
             f"demonstration {index} contradicts the others: its path comes within {c.path * 1e3:.0f} mm of a surface, "
             f"its lowest fingertip is {c.lowest * 1e3:.0f} mm above the table, and it is {likeness[index]:.2f} like "
             f"the others ({usual:.2f}); look at it, and remove it if it is wrong"
         )
-        severity: Severity = "error" if apart or not fits(c, view.noise) else "warning"
+        severity: Severity = "error" if apart or not fits(c, view) else "warning"
         numbers = {"demonstration": float(index), "path_gap": c.path, "likeness": float(likeness[index])}
         found.append(Finding("contradiction", severity, words, numbers, f"demonstration {index}"))
     return found

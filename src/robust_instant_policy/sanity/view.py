@@ -17,6 +17,7 @@ from robust_instant_policy.pointcloud import in_metres, steady, table_plane
 MAX_EDGE_PX = 160  # the longer edge of the grid
 RAISED_M = 0.012  # height above the table from which a point belongs to an object,
 RAISED_DEVIATIONS = 5.0  # or this many deviations of the depth's noise, if that is more
+MUCH_BELOW = 0.3  # share of the readings below a plane that make it no table
 MIN_POINTS = 100  # readings below which an image says nothing
 PLANE_SEED = 0
 FAR_AWAY_M = 1e3
@@ -74,6 +75,12 @@ class View:
     def num_readings(self) -> int:
         """Pixels of the grid with a steady depth."""
         return int(np.isfinite(self.depth).sum())
+
+    @property
+    def is_support(self) -> bool:
+        """Whether the plane is what things stand on: not the top of something large, with much of the image below."""
+        known = np.isfinite(self.height)
+        return bool((self.height[known] < -RAISED_M).mean() < MUCH_BELOW) if known.any() else False
 
     @property
     def tilt(self) -> float:
