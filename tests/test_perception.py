@@ -7,8 +7,9 @@ from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError
 from robust_instant_policy.geometry import invert_pose, make_pose, rotations_about_vertical, transform_points
 from robust_instant_policy.perception import PAPER_SIMULATION, KeypointExtractor, measure
-from robust_instant_policy.perception.depth import in_metres, surface_depth
+from robust_instant_policy.perception.depth import surface_depth
 from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors
+from robust_instant_policy.pointcloud import in_metres
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 from tests.pages import Page

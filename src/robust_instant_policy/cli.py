@@ -16,6 +16,7 @@ from robust_instant_policy.errors import RipError
 COMMANDS = {
     "demo": "record demonstrations, plan in a new scene, execute, explain",
     "record": "record demonstrations into a dataset folder",
+    "check": "whether demonstrations, images and a new scene fit together; names what is wrong",
     "plan": "plan for one observation and write plan.json; nothing moves",
     "eval": "the paper's evaluation, or a part of it; goes on where it stopped",
     "train": "train dp or kat-dp on demonstrations; goes on where it stopped",

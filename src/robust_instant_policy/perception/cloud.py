@@ -11,9 +11,9 @@ from scipy.ndimage import label, maximum_filter, uniform_filter
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError
 from robust_instant_policy.geometry import FloatArray, lift
-from robust_instant_policy.perception.depth import in_metres, steady
 from robust_instant_policy.perception.descriptors import DescriptorMap, Float32Array, IntArray
-from robust_instant_policy.perception.table import TableColour, table_plane
+from robust_instant_policy.perception.table import TableColour
+from robust_instant_policy.pointcloud import in_metres, steady, table_plane
 
 MAX_EDGE_PX = 256  # clouds of larger images are thinned out: enough for millimetres, and quick
 MIN_STEADY = 100  # pixels with a trustworthy depth

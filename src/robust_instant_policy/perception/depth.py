@@ -1,4 +1,4 @@
-"""Depth as real cameras give it: holes, flying pixels at edges, sometimes millimetres."""
+"""Depth of a surface where the image has holes and flying pixels."""
 
 from __future__ import annotations
 
@@ -6,34 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.pointcloud import SURFACE_TOLERANCE
 
-MILLIMETRES_ABOVE = 20.0  # a median depth beyond 20 "metres" is millimetres: arms do not reach that far
-SURFACE_TOLERANCE = 0.015  # share of the depth within which neighbouring readings are one surface
-STEADY_NEIGHBOURS = 3
 MIN_SUPPORT = 3  # readings of a surface below which it is taken for flying pixels
-
-
-def in_metres(image: ArrayLike) -> tuple[NDArray[np.float32], str]:
-    """Depth with NaN for every missing reading, in metres, and a line that says so if it was in millimetres."""
-    depth: NDArray[np.float32] = np.array(image, dtype=np.float32)
-    depth[~np.isfinite(depth) | (depth <= 0)] = np.nan
-    if np.isfinite(depth).any() and np.nanmedian(depth) > MILLIMETRES_ABOVE:
-        return (depth / 1000).astype(
-            np.float32
-        ), f"depth with a median of {np.nanmedian(depth):.0f} was read as millimetres"
-    return depth, ""
-
-
-def steady(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Pixels ``(H, W)`` that have a reading and agree with `STEADY_NEIGHBOURS` of their four neighbours."""
-    agree = np.zeros(depth.shape, dtype=np.uint8)
-    down = np.abs(depth[1:] - depth[:-1]) < SURFACE_TOLERANCE * depth[1:]
-    right = np.abs(depth[:, 1:] - depth[:, :-1]) < SURFACE_TOLERANCE * depth[:, 1:]
-    agree[1:] += down
-    agree[:-1] += down
-    agree[:, 1:] += right
-    agree[:, :-1] += right
-    return agree >= STEADY_NEIGHBOURS
 
 
 def surface_depth(depth: NDArray[np.float32], pixels: ArrayLike, radius: int = 2) -> FloatArray:

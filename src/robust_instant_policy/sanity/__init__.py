@@ -1,0 +1,17 @@
+"""Does the geometry of demonstrations, images and plans hold together?"""
+
+from robust_instant_policy.sanity.envelope import Envelope
+from robust_instant_policy.sanity.finding import DemonstrationError, EnvelopeError, Finding, GeometryError, errors
+from robust_instant_policy.sanity.report import Reference, SetReport, check_demonstrations
+
+__all__ = [
+    "DemonstrationError",
+    "Envelope",
+    "EnvelopeError",
+    "Finding",
+    "GeometryError",
+    "Reference",
+    "SetReport",
+    "check_demonstrations",
+    "errors",
+]

@@ -1,0 +1,96 @@
+"""Do the colour and the depth image show the same scene? Edges of depth must be edges of colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_gradient_magnitude, maximum_filter, minimum_filter
+from scipy.optimize import linear_sum_assignment
+
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.sanity.hypotheses import TURNS
+from robust_instant_policy.sanity.view import View
+
+EDGE_SIGMA_PX = 0.7
+MIN_EDGE_PIXELS = 12  # of depth below which nothing can be said
+FAR_SHIFTS = ((0.13, 0.07), (-0.11, 0.17), (0.21, -0.12), (-0.16, -0.19), (0.29, 0.23), (-0.27, 0.05), (0.05, -0.31))
+"""Displacements, as shares of the image, at which depth and colour cannot agree but by chance."""
+NEAR_SHARE = 0.16  # of the image that a depth image may be displaced to be called not aligned
+CLEARLY = 1.35  # times as strong as by chance: edges agree
+NAMED = 1.25  # times as strong as now: a displacement or turn that explains it
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """``own`` is the mean strength of colour edges along depth edges, ``chance`` the median of that over `FAR_SHIFTS`;
+    ``cause`` names what makes them agree better, with the strength ``best`` then. NaN where there are too few edges.
+    """
+
+    own: float
+    chance: float
+    best: float
+    cause: str
+
+    @property
+    def ratio(self) -> float:
+        """How much stronger than by chance; about 1 where the images have nothing to do with each other."""
+        return self.own / self.chance if self.chance > 0 else float("nan")
+
+
+def colour_edges(rgb: NDArray[np.float32]) -> FloatArray:
+    """Strength ``(h, w)`` of the edges of ``rgb (h, w, 3)``, saturated, so that no single edge decides."""
+    channels = np.moveaxis(rgb, -1, 0)
+    strength = np.max([gaussian_gradient_magnitude(channel, EDGE_SIGMA_PX) for channel in channels], axis=0)
+    strength = maximum_filter(strength, size=3)
+    return np.minimum(strength / (np.percentile(strength, 97) + 1.0), 1.0)
+
+
+def depth_edges(view: View) -> NDArray[np.bool_]:
+    """Where raised things end ``(h, w)``, away from the image's border."""
+    edges = maximum_filter(view.raised, size=3) & ~minimum_filter(view.raised, size=3)
+    edges[[0, 1, -2, -1]] = False
+    edges[:, [0, 1, -2, -1]] = False
+    return edges
+
+
+def agreement(view: View) -> Agreement:
+    """Of the colour and the depth image of ``view``."""
+    edges, colour = depth_edges(view), colour_edges(view.rgb)
+    if edges.sum() < MIN_EDGE_PIXELS:
+        return Agreement(float("nan"), float("nan"), float("nan"), "")
+    size = np.array(edges.shape)
+    own = float(colour[edges].mean())
+    chance = float(
+        np.median([colour[np.roll(edges, tuple(np.rint(size * s).astype(int)), (0, 1))].mean() for s in FAR_SHIFTS])
+    )
+    found = Agreement(own, chance, own, "")
+    if found.ratio >= CLEARLY:
+        return found
+    tried = [(float(colour[edges[::rows, ::cols]].mean()), f"one of them {what}") for what, rows, cols in TURNS]
+    # all displacements at once: the sum of colour edges under displaced depth edges is a cross-correlation
+    spectrum = np.fft.rfft2(edges.astype(float)).conj() * np.fft.rfft2(colour)
+    sums = np.fft.fftshift(np.fft.irfft2(spectrum, s=edges.shape)) / edges.sum()
+    middle, reach = size // 2, np.maximum((size * NEAR_SHARE).astype(int), 2)
+    window = sums[middle[0] - reach[0] : middle[0] + reach[0] + 1, middle[1] - reach[1] : middle[1] + reach[1] + 1]
+    row, col = np.unravel_index(int(window.argmax()), window.shape)
+    by = np.array([col - reach[1], row - reach[0]]) * view.every
+    tried.append(
+        (
+            float(window.max()),
+            f"depth moved by {by[0]:+d}, {by[1]:+d} pixels (it is not aligned to colour, or of another scene)",
+        )
+    )
+    best, cause = max(tried)
+    return Agreement(own, chance, best, cause if best > NAMED * max(own, chance) else "")
+
+
+def exchanged(views: Sequence[View]) -> tuple[int, float, float]:
+    """How many colour images fit the depth of another view better, when images are exchanged for the best fit; the
+    mean strength of edges then, and as they are."""
+    edges, colours = [depth_edges(view) for view in views], [colour_edges(view.rgb) for view in views]
+    strength = np.array([[colour[e].mean() if e.any() else 0.0 for colour in colours] for e in edges])
+    rows, order = linear_sum_assignment(-strength)
+    return int((order != rows).sum()), float(strength[rows, order].mean()), float(np.diag(strength).mean())

@@ -1,0 +1,83 @@
+"""Does the gripper's path touch what its own start image shows?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.sanity.view import View
+from robust_instant_policy.trajectory import Trajectory
+
+PATH_STEPS = 60  # of a demonstration are compared with the image, and those at which a gripper closes
+BETWEEN_FINGERS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # points between the fingertips, as shares of the way
+FARTHEST_M = 0.25  # larger distances count as this
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """How a path lies to a scene, in metres.
+
+    ``path`` is the smallest gap over the path between the fingers and a raised surface (0: it passes through what
+    the image shows there); ``grasps (G,)`` the gaps where grippers close; ``lowest`` the smallest height of a
+    fingertip above the table, ``lowest_palm`` that of a palm; ``buried`` the largest depth of a palm behind a
+    raised surface.
+    """
+
+    path: float
+    grasps: FloatArray
+    lowest: float
+    lowest_palm: float
+    buried: float
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """The steps of a trajectory that are compared with images.
+
+    ``fingers (M, 3)`` points between the fingertips, ``palms (P, 3)``, ``tips (2P, 3)`` and ``closings (G, 3)``, the
+    middle between the fingertips where a gripper closes.
+    """
+
+    fingers: FloatArray
+    palms: FloatArray
+    tips: FloatArray
+    closings: FloatArray
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Path:
+        """Thin ``trajectory`` out; idle arms, which never move, touch nothing."""
+        closed = trajectory.gripper_state > 0.5
+        closing = np.argwhere(closed[1:] & ~closed[:-1]) + np.array([1, 0])
+        steps = np.unique(np.round(np.linspace(0, len(trajectory) - 1, PATH_STEPS)).astype(np.intp))
+        steps = np.union1d(steps, closing[:, 0])
+        triplets = trajectory.triplets
+        kept = triplets[steps].reshape(-1, 3, 3)
+        left, right = kept[:, 1, None], kept[:, 2, None]
+        fingers = (left + BETWEEN_FINGERS[:, None] * (right - left)).reshape(-1, 3)
+        middles = triplets[:, :, 1:].mean(axis=2)
+        return cls(fingers, kept[:, 0], kept[:, 1:].reshape(-1, 3), middles[closing[:, 0], closing[:, 1]])
+
+
+def gaps(view: View, points: FloatArray) -> FloatArray:
+    """Distance ``(N,)`` from ``points (N, 3)`` to the nearest raised surface, 0 inside or under one."""
+    if len(points) == 0:
+        return np.zeros(0)
+    behind, raised = view.behind_surface(points)
+    inside = raised & (np.nan_to_num(behind, nan=-1.0) >= 0) & (view.above_plane(points) > 0)
+    distance = np.minimum(view.tree.query(points)[0], FARTHEST_M)
+    return np.where(inside, 0.0, distance)
+
+
+def contact(view: View, path: Path) -> Contact:
+    """How ``path`` lies to the scene of ``view``."""
+    behind, raised = view.behind_surface(path.palms)
+    buried = behind[raised & np.isfinite(behind)]
+    return Contact(
+        path=float(gaps(view, path.fingers).min()),
+        grasps=gaps(view, path.closings),
+        lowest=float(view.above_plane(path.tips).min()),
+        lowest_palm=float(view.above_plane(path.palms).min()),
+        buried=float(buried.max(initial=0.0)),
+    )

@@ -1,0 +1,181 @@
+"""A new scene against what the demonstrations' images have in common."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.sanity.finding import Finding
+from robust_instant_policy.sanity.hypotheses import OF_DEPTH, OF_IMAGES, OF_POSE
+from robust_instant_policy.sanity.scenery import CameraChange, Likeness, Scenery, camera_change
+from robust_instant_policy.sanity.view import View
+
+SAME_PICTURE = 0.9  # share of the scenery's depth that must agree, of what the demonstrations' own agree
+SAME_TEXTURE = 0.5  # of the demonstrations' own correlation
+SURE_TEXTURE = 0.95  # of it, below which an image may be turned round
+CALIBRATION_M, CALIBRATION_RAD = 0.01, np.deg2rad(1.0)  # that a pose may change where the picture does not
+CALIBRATION_K = 0.03  # and the intrinsics, relatively
+TABLE_M, TABLE_RAD = 0.02, np.deg2rad(2.0)  # that the table may differ from the demonstrations'
+RESTORED = 0.6  # of the demonstrations' own correlation, that a displacement must restore
+MOVED_CLEARER = 0.1  # and by which it must be better than without
+CLEARER = 0.05  # by which a correlation or share must be better to explain a picture
+MUCH_TEXTURE = 0.8  # from which texture survives another camera's resolution
+SAME_IN_WORLD = 0.3  # of the demonstrations' own correlation, of texture on the table seen by another camera
+MISSING = 0.2  # share of the scenery without depth that no camera noise explains
+MIN_PLANE = 0.4
+
+
+def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
+    """For demonstrations from one fixed camera: has the camera, its calibration or the picture changed since?"""
+    observation = view.observation
+    change = camera_change(scenery.reference, observation)
+    if observation.rgb.shape != scenery.reference.rgb.shape:
+        old, new = scenery.reference.rgb.shape, observation.rgb.shape
+        words = f"the image has {new[1]}x{new[0]} pixels, the demonstrations' have {old[1]}x{old[0]}"
+        return [Finding("camera", "warning", f"{words}: scenery was not compared", cause="another resolution")]
+    small = change.moved < CALIBRATION_M and change.turned < CALIBRATION_RAD and change.intrinsics < CALIBRATION_K
+    like = scenery.likeness(view)
+    if not np.isfinite(like.depth):
+        return [Finding("scenery", "unchecked", "too little of the scenery is visible to compare it")]
+    found = []
+    missing = float(np.isnan(view.depth)[scenery.static].mean())
+    if missing > MISSING:
+        words = f"depth is missing in {missing:.0%} of the scenery that the demonstrations' images have"
+        advice = "; is it of another lens or stream, or not aligned to colour?"
+        found.append(Finding("scenery", "error", words + advice, {"missing": missing}, "depth of another lens"))
+    if small and scenery.swapped(view):
+        words = "red and blue are exchanged: the image is BGR, the demonstrations' are RGB, or the other way round"
+        found.append(Finding("scenery", "error", words, cause="BGR"))
+    same_depth = like.depth >= SAME_PICTURE * scenery.agreed
+    moved = _shifted(view, scenery, like) if scenery.textured and small else None
+    turned = _turned(view, scenery, like, same_depth) if small else None
+    same_texture = not scenery.textured or like.texture >= SAME_TEXTURE * scenery.texture
+    numbers = {
+        "same_depth": like.depth,
+        "texture": like.texture,
+        "moved": change.moved,
+        "turned": change.turned,
+        "intrinsics": change.intrinsics,
+    }
+    if same_depth and same_texture and not moved and not turned:
+        if small:
+            return found
+        cause = _name_calibration(scenery.reference, observation, change)
+        words = f"the picture is the demonstrations', but its camera is said to be {change}"
+        return [*found, Finding("camera", "error", f"{words}: {cause}", numbers, cause)]
+    if small:
+        return [*found, _picture_changed(view, scenery, like, same_depth, moved, turned, numbers)]
+    # Another camera, or one that was moved and calibrated: only the world can be compared.
+    there = scenery.texture_in_world(view)
+    if scenery.texture >= MUCH_TEXTURE and there < SAME_IN_WORLD * scenery.texture:
+        words = f"the camera is {change}, and where its calibration puts the table the texture is another"
+        advice = f" ({there:.2f} against {scenery.texture:.2f}): is the new calibration right, and the table the same?"
+        found.append(
+            Finding("camera", "warning", words + advice, {**numbers, "texture_in_world": there}, "camera moved")
+        )
+    return found
+
+
+def _name_calibration(old: Observation, new: Observation, change: CameraChange) -> str:
+    for hypothesis in OF_POSE:
+        if hypothesis.pose is None:
+            continue
+        corrected = replace(new, camera_pose=hypothesis.pose(new.camera_pose))
+        fixed = camera_change(old, corrected)
+        if fixed.moved < CALIBRATION_M and fixed.turned < CALIBRATION_RAD:
+            return f"{hypothesis.cause} is the demonstrations'; {hypothesis.remedy}"
+    if change.intrinsics >= CALIBRATION_K:
+        ratio = new.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] / old.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+        told = ", ".join(f"{name} x{value:.3g}" for name, value in zip(("fx", "fy", "cx", "cy"), ratio, strict=True))
+        return f"intrinsics of another camera or resolution, or a wrong focal length or principal point ({told})"
+    return "the camera pose is wrong, here or in the demonstrations; calibrate the camera once for both"
+
+
+def _picture_changed(
+    view: View,
+    scenery: Scenery,
+    like: Likeness,
+    same_depth: bool,
+    moved: tuple[int, int] | None,
+    turned: tuple[str, str] | None,
+    numbers: dict[str, float],
+) -> Finding:
+    """The camera is said to be the same, and the picture is not: name what restores it."""
+    if turned:
+        return Finding("scenery", "error", turned[1], numbers, turned[0])
+    texture_holds = scenery.textured and like.texture >= SAME_TEXTURE * scenery.texture
+    if not same_depth and (texture_holds or not scenery.textured or abs(like.ratio - 1) > 0.3):
+        numbers = {**numbers, "ratio": like.ratio, "offset": like.offset}
+        for hypothesis in OF_DEPTH:
+            fixed = scenery.likeness(View.of(hypothesis.correct(view.observation)))
+            if fixed.depth >= SAME_PICTURE * scenery.agreed:
+                words = f"depth reads {like.ratio:.3g} times the demonstrations' over the same scenery"
+                cause = hypothesis.cause
+                return Finding(
+                    "scenery", "error", f"{words}; with {cause} it agrees: {hypothesis.remedy}", numbers, cause
+                )
+        words = f"depth reads {like.ratio:.3g} times the demonstrations' ({like.offset * 100:+.1f} cm)"
+        advice = (
+            "; check the depth unit and calibration, and whether the camera was moved towards or away from the table"
+        )
+        return Finding("scenery", "error", words + advice, numbers, "depth scale, or camera moved")
+    if moved:
+        cols, rows = moved
+        metres = float(np.hypot(cols, rows) * np.nanmedian(view.depth) / abs(view.observation.intrinsics[0, 0]))
+        words = f"the camera was moved: the scenery is displaced by {cols:+d}, {rows:+d} pixels ({metres * 100:.0f} cm)"
+        advice = "; calibrate it anew, or put it back"
+        return Finding("scenery", "error", words + advice, {**numbers, "shift": metres}, "camera moved")
+    if not same_depth:
+        words = f"{like.depth:.0%} of the scenery's depth are as in the demonstrations"
+        advice = ": the camera was moved, or the depth is of another scene or stream"
+        return Finding("scenery", "error", words + advice, numbers, "camera moved")
+    words = f"the scenery looks different (texture agrees by {like.texture:.2f}, theirs by {scenery.texture:.2f})"
+    advice = ": the camera was moved, the colour image is of another stream, or the table is covered"
+    return Finding("scenery", "error", words + advice, numbers, "camera moved, or another colour image")
+
+
+def _turned(view: View, scenery: Scenery, like: Likeness, same_depth: bool) -> tuple[str, str] | None:
+    """Cause and message where the picture, turned round or mirrored, is the demonstrations'."""
+    if same_depth and not like.texture < SURE_TEXTURE * scenery.texture:
+        return None
+    for hypothesis in OF_IMAGES:
+        turned = scenery.likeness(View.of(hypothesis.correct(view.observation)))
+        what = hypothesis.cause.removeprefix("the image ")
+        enough = max(SAME_TEXTURE * scenery.texture, like.texture + CLEARER)
+        if scenery.textured and turned.texture > enough and (same_depth or turned.depth >= like.depth - CLEARER):
+            words = (
+                f"the image is {what}: turned back, its texture agrees by {turned.texture:.2f} (now {like.texture:.2f})"
+            )
+            return f"colour image {what}", f"{words}; {hypothesis.remedy}"
+        if turned.depth >= SAME_PICTURE * scenery.agreed and turned.depth > like.depth + CLEARER:
+            words = f"the depth image is {what}: turned back, {turned.depth:.0%} of it agree (now {like.depth:.0%})"
+            return f"depth image {what}", f"{words}; {hypothesis.remedy}"
+    return None
+
+
+def _shifted(view: View, scenery: Scenery, like: Likeness) -> tuple[int, int] | None:
+    """By how many columns and rows the picture is displaced, None where its texture fits best as it is."""
+    cols, rows, there = scenery.shift(view)
+    restored = there > max(RESTORED * scenery.texture, like.texture + MOVED_CLEARER)
+    return (cols, rows) if (cols or rows) and restored else None
+
+
+def check_table(view: View, plane: FloatArray, centre: FloatArray) -> list[Finding]:
+    """The table must be where the demonstrations' table is, at their ``centre (3,)``, wherever the camera is."""
+    if view.share_on_plane < MIN_PLANE:
+        words = f"only {view.share_on_plane:.0%} of the image are one plane: the table's height was not checked"
+        return [Finding("table", "unchecked", words, {"share_on_plane": view.share_on_plane})]
+    offset = float(centre @ view.plane[:3] + view.plane[3])
+    angle = float(np.arccos(np.clip(view.plane[:3] @ plane[:3], -1, 1)))
+    if abs(offset) <= TABLE_M and angle <= TABLE_RAD:
+        return []
+    words = (
+        f"the table lies {abs(offset) * 100:.1f} cm {'below' if offset > 0 else 'above'} the demonstrations' table, "
+        f"turned by {np.rad2deg(angle):.1f} degrees"
+    )
+    numbers = {"table_offset": offset, "table_angle": angle}
+    advice = "; the camera's pose or the depth is wrong"
+    return [Finding("table", "error", words + advice, numbers, "camera pose or depth: the table moved")]

@@ -1,0 +1,137 @@
+"""One observation as the checks see it: a thinned grid of points, the table plane, and what is raised above it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from scipy.spatial import cKDTree
+
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.geometry import FloatArray, invert_pose, lift, transform_points
+from robust_instant_policy.pointcloud import in_metres, steady, table_plane
+
+MAX_EDGE_PX = 160  # the longer edge of the grid
+RAISED_M = 0.012  # height above the table from which a point belongs to an object,
+RAISED_DEVIATIONS = 5.0  # or this many deviations of the depth's noise, if that is more
+MUCH_BELOW = 0.3  # share of the readings below a plane that make it no table
+MIN_POINTS = 100  # readings below which an image says nothing
+PLANE_SEED = 0
+FAR_AWAY_M = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A grid ``(h, w)`` of every ``every``-th pixel of an observation.
+
+    ``depth (h, w)`` metres, NaN without a steady reading; ``points (h, w, 3)`` metres, world; ``rgb (h, w, 3)`` in
+    0 to 255; ``plane (4,)`` unit normal (upward) and offset of the table; ``height (h, w)`` metres above it;
+    ``noise`` the deviation of the table's points from the plane, metres; ``raised (h, w)`` bool, above the table.
+    ``share_on_plane`` is the share of the readings that lie on the plane.
+    """
+
+    observation: Observation
+    every: int
+    depth: NDArray[np.float32]
+    rgb: NDArray[np.float32]
+    points: FloatArray
+    plane: FloatArray
+    height: FloatArray
+    noise: float
+    share_on_plane: float
+    raised: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, observation: Observation, repaired: bool = False) -> View:
+        """The grid of ``observation``; depth in millimetres is read as such.
+
+        Flying pixels are left out, unless the image is ``repaired``, as `coarse` does.
+        """
+        depth, _ = in_metres(observation.depth)
+        every = -(-max(depth.shape) // MAX_EDGE_PX)
+        grid = (depth if repaired else _without_flying_pixels(depth))[::every, ::every]
+        rgb = observation.rgb[::every, ::every].astype(np.float32)
+        rows, cols = np.mgrid[: grid.shape[0], : grid.shape[1]] * every
+        points = lift(np.stack([cols, rows], axis=-1), grid, observation.intrinsics, observation.camera_pose)
+        known = np.isfinite(grid)
+        if known.sum() < MIN_POINTS:
+            nothing = np.zeros(grid.shape, dtype=bool)
+            return cls(
+                observation, every, grid, rgb, points, np.array([0.0, 0, 1, 0]), points[..., 2], 0.0, 0.0, nothing
+            )
+        plane = table_plane(points[known], PLANE_SEED)
+        height = points @ plane[:3] + plane[3]
+        flat = np.abs(height[known])[np.abs(height[known]) < 3 * RAISED_M]
+        noise = float(1.4826 * np.median(flat)) if len(flat) else 0.0
+        raised = np.nan_to_num(height, nan=-1.0) > max(RAISED_M, RAISED_DEVIATIONS * noise)
+        raised = median_filter(raised, size=3) if noise > 1e-3 else raised
+        share = float((np.abs(height[known]) < max(RAISED_M, RAISED_DEVIATIONS * noise)).mean())
+        return cls(observation, every, grid, rgb, points, plane, height, noise, share, raised)
+
+    @property
+    def num_readings(self) -> int:
+        """Pixels of the grid with a steady depth."""
+        return int(np.isfinite(self.depth).sum())
+
+    @property
+    def is_support(self) -> bool:
+        """Whether the plane is what things stand on: not the top of something large, with much of the image below."""
+        known = np.isfinite(self.height)
+        return bool((self.height[known] < -RAISED_M).mean() < MUCH_BELOW) if known.any() else False
+
+    @property
+    def tilt(self) -> float:
+        """Angle between the table's normal and the world's z axis, rad."""
+        return float(np.arccos(np.clip(self.plane[2], -1, 1)))
+
+    @property
+    def camera_height(self) -> float:
+        """Of the camera above the table plane, metres; negative where it looks from below."""
+        return float(self.observation.camera_pose[:3, 3] @ self.plane[:3] + self.plane[3])
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Nearest raised point; where nothing is raised, one far away."""
+        points = self.points[self.raised & np.isfinite(self.depth)]
+        return cKDTree(points if len(points) else np.full((1, 3), FAR_AWAY_M))
+
+    def above_plane(self, points: FloatArray) -> FloatArray:
+        """Heights ``(...)`` of ``points (..., 3)`` above the table, metres."""
+        return points @ self.plane[:3] + self.plane[3]
+
+    def behind_surface(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """How far ``points (N, 3)`` lie behind the surface seen at their pixels, metres, and whether that is raised.
+
+        NaN where a point is outside the image or nothing was read there; negative: in front of the surface.
+        """
+        local = transform_points(invert_pose(self.observation.camera_pose), points)
+        image = local @ self.observation.intrinsics.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cells = np.rint(image[:, :2] / image[:, 2:] / self.every)
+        height, width = self.depth.shape
+        inside = (local[:, 2] > 0) & np.isfinite(cells).all(axis=1)
+        inside &= (cells >= 0).all(axis=1) & (cells[:, 0] < width) & (cells[:, 1] < height)
+        col, row = np.where(inside[:, None], cells, 0).astype(np.intp).T
+        behind = np.where(inside, local[:, 2] - self.depth[row, col], np.nan)
+        return behind, inside & self.raised[row, col]
+
+
+def coarse(observation: Observation, max_edge: int) -> Observation:
+    """``observation`` on a grid of at most ``max_edge`` pixels along the longer edge, flying pixels left out."""
+    every = -(-max(observation.depth.shape) // max_edge)
+    depth, _ = in_metres(observation.depth)
+    shrink = np.array([[1 / every, 1, 1 / every], [1, 1 / every, 1 / every], [1, 1, 1]])
+    return replace(
+        observation,
+        rgb=observation.rgb[::every, ::every],
+        depth=_without_flying_pixels(depth)[::every, ::every],
+        intrinsics=observation.intrinsics * shrink,
+    )
+
+
+def _without_flying_pixels(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    with np.errstate(invalid="ignore"):
+        return np.where(steady(depth), depth, np.float32("nan"))

@@ -1,0 +1,183 @@
+"""Recordings and scenes that contradict themselves are named; sound ones pass."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.faults import FAULTS, points
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.cli import main
+from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.sanity import (
+    DemonstrationError,
+    EnvelopeError,
+    GeometryError,
+    check_demonstrations,
+    errors,
+)
+from robust_instant_policy.tasks.camera_noise import CameraNoise
+from robust_instant_policy.trajectory import downsample
+
+
+@pytest.fixture(scope="module")
+def demonstrations(workbench):
+    return load_demonstrations(workbench / "data" / "push-cube")
+
+
+@pytest.fixture(scope="module")
+def scene(workbench):
+    return Observation.load(workbench / "observation.npz")
+
+
+@pytest.fixture(scope="module")
+def report(demonstrations):
+    return check_demonstrations(demonstrations)
+
+
+def about_its_middle(turn, triplets):
+    """Grippers turned about the middle of their fingertips."""
+    middle = triplets[..., 1:, :].mean(axis=-2, keepdims=True)
+    return (triplets - middle) @ turn.T + middle
+
+
+def told(findings):
+    return " ".join(f"{finding.message} {finding.cause}" for finding in errors(findings))
+
+
+def test_sound_demonstrations_and_a_sound_scene_pass(report, scene):
+    report.raise_if_wrong()
+    assert report.require_observation(scene) == ()
+    assert report.reference.scene_spread_m > 0.02
+
+
+def test_the_noise_of_a_depth_camera_is_no_error(demonstrations, scene):
+    noise = CameraNoise()
+    noisy = [replace(d, observation=noise.photograph(d.observation, i)) for i, d in enumerate(demonstrations)]
+    report = check_demonstrations(noisy)
+    report.raise_if_wrong()
+    assert not errors(report.check_observation(noise.photograph(scene, 99)))
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("opengl-axes:demos", "OpenGL"),
+        ("f-double:demos", "focal length"),
+        ("f-half-and-centre:demos", "resolution"),
+        ("depth-0.1:demos", "depth multiplied by 10"),
+        ("depth-10:demos", "depth multiplied by 0.1"),
+        ("depth-0.25:demos", "depth multiplied by 4"),
+        ("upside-down:demos", "upside down"),
+        ("mirrored:demos", "mirrored"),
+        ("camera-10cm-low:demos", "camera"),
+        ("camera-10cm-high:demos", "below the table"),
+    ],
+)
+def test_demonstrations_whose_geometry_is_wrong_are_refused_and_the_mistake_is_named(demonstrations, fault, words):
+    with pytest.raises(GeometryError, match=words):
+        check_demonstrations(FAULTS[fault].demonstrations(demonstrations)).raise_if_wrong()
+
+
+def test_trajectories_shuffled_against_their_images_are_refused(demonstrations):
+    found = check_demonstrations(FAULTS["shuffled:demos"].demonstrations(demonstrations)).findings
+    assert "other images" in told(found)
+
+
+def test_quaternions_read_in_the_wrong_order_are_named(demonstrations):
+    turned = []
+    for index, demonstration in enumerate(demonstrations):
+        turn = Rotation.from_euler("z", 25.0 * index, degrees=True).as_matrix()
+        turned += points(partial(about_its_middle, turn))([demonstration])
+    with pytest.raises(GeometryError, match="quaternion"):
+        check_demonstrations(FAULTS["quaternion-order:demos"].demonstrations(turned)).raise_if_wrong()
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("inverse-pose:scene", "inverse camera pose"),
+        ("opengl-axes:scene", "OpenGL"),
+        ("f-half:scene", "intrinsics"),
+        ("depth-0.9:scene", "depth"),
+        ("rgb-upside-down:scene", "upside down"),
+        ("mirrored:scene", "mirrored"),
+        ("depth-of-another:scene", "edges of depth"),
+        ("camera-10cm-x:scene", "camera"),
+        ("camera-10cm-low:scene", "camera"),
+        ("moved-sideways:scene", "camera was moved"),
+        ("lowered:scene", "camera"),
+        ("no-depth:scene", "depth"),
+        ("black:scene", "colour"),
+        ("bgr:scene", "red and blue are exchanged"),
+        ("depth-other-lens:scene", "another lens"),
+    ],
+)
+def test_a_scene_that_contradicts_the_demonstrations_is_refused_and_the_mistake_is_named(
+    report, demonstrations, scene, fault, words
+):
+    with pytest.raises(GeometryError, match=words):
+        report.require_observation(FAULTS[fault].scene(scene, demonstrations))
+
+
+def test_another_camera_is_no_error_where_its_calibration_is_right(report, scene):
+    margin = scene.rgb.shape[0] // 8
+    cut = slice(margin, None), slice(2 * margin, None)  # the part of the image that a camera beside it would see
+    shift = np.array([[0, 0, 2 * margin], [0, 0, margin], [0, 0, 0]])
+    index = np.clip(np.arange(scene.rgb.shape[0]) + margin, 0, scene.rgb.shape[0] - 1)
+    across = np.clip(np.arange(scene.rgb.shape[1]) + 2 * margin, 0, scene.rgb.shape[1] - 1)
+    depth = np.full_like(scene.depth, np.nan)
+    depth[:-margin, : -2 * margin] = scene.depth[cut]
+    moved = replace(scene, rgb=scene.rgb[index][:, across], depth=depth, intrinsics=scene.intrinsics - shift)
+    findings = report.check_observation(moved)
+    assert not [finding for finding in errors(findings) if finding.kind != "scenery"]
+    assert not any("texture is another" in str(finding) for finding in findings)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("actions-mm:demos", "millimetres"),
+        ("one-step:demos", "step"),
+        ("100x-longer:demos", "times as long"),
+        ("contradicts:demos", "demonstration 4 contradicts"),
+        ("tasks-mixed:demos", "several tasks"),
+    ],
+)
+def test_demonstrations_that_do_not_belong_together_are_refused(demonstrations, fault, words):
+    with pytest.raises((DemonstrationError, GeometryError), match=words):
+        check_demonstrations(FAULTS[fault].demonstrations(demonstrations)).raise_if_wrong()
+
+
+def test_demonstrations_of_one_scene_say_that_others_lie_outside(demonstrations, scene):
+    report = check_demonstrations(FAULTS["one-scene:demos"].demonstrations(demonstrations))
+    assert not errors(report.findings)
+    assert any("one scene" in note for note in report.notes)
+    assert report.reference.scene_spread_m < 0.001
+
+
+def test_what_was_demonstrated_lies_inside_its_own_envelope(report, demonstrations):
+    for demonstration in demonstrations:
+        assert report.envelope.check(downsample(demonstration.trajectory)) == ()
+
+
+@pytest.mark.parametrize("fault", [name for name in FAULTS if name.endswith(":plan") and name != "too-low-3cm:plan"])
+def test_a_plan_outside_the_envelope_is_refused_with_the_step_and_the_limit(report, demonstrations, fault):
+    plan = FAULTS[fault].plan(downsample(demonstrations[0].trajectory))
+    with pytest.raises(EnvelopeError):
+        report.envelope.require(plan)
+    assert all(np.isfinite(finding.numbers["limit"]) for finding in report.envelope.check(plan))
+
+
+def test_the_command_tells_what_is_wrong_with_a_scene(workbench, scene, tmp_path: Path, capsys):
+    demos = str(workbench / "data" / "push-cube")
+    assert main(["check", "--demos", demos, "--observation", str(workbench / "observation.npz")]) == 0
+    wrong = tmp_path / "wrong.npz"
+    FAULTS["inverse-pose:scene"].scene(scene, ()).save(wrong)
+    assert main(["check", "--demos", demos, "--observation", str(wrong)]) == 1
+    assert "inverse camera pose" in capsys.readouterr().out
