@@ -23,7 +23,7 @@ from pick_and_place import WITHIN_M, PickAndPlace, Scene, key_error
 from prompting import FIRST_NEW_SEED, NUM_DEMOS, fitted
 
 from robust_instant_policy.llm import Listener, RecordedModel, SampleStore, Sampling, connect
-from robust_instant_policy.policies.rip import ENOUGH_CONFIDENCE
+from robust_instant_policy.policies.rip import ENOUGH_AGREEMENT
 from robust_instant_policy.policies.sampling import MIN_CANDIDATES as FIRST_QUERIES
 from robust_instant_policy.regression import robust_gripper_trajectory
 from robust_instant_policy.trajectory import Trajectory
@@ -34,7 +34,7 @@ MOST = 10  # samples a scene
 TEMPERATURE = 0.7
 SHARES = (0.0, 0.2, 0.4)  # of the candidates that are hallucinated
 DRAWS = 10  # of which candidates those are, for each scene
-THRESHOLDS = tuple(sorted({0.2, 0.3, 0.4, 0.6, 0.8, ENOUGH_CONFIDENCE}))
+THRESHOLDS = tuple(sorted({0.2, 0.3, 0.4, 0.6, 0.8, ENOUGH_AGREEMENT}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ def made_up(scenes: int) -> list[Line]:
         for count in (FIRST_QUERIES, 5, MOST):
             lines.append(line(f"Q = {count}", lambda plans, count=count: count))
         for threshold in THRESHOLDS:
-            name = f"adaptive, until {threshold:g}" + (" (the default)" if threshold == ENOUGH_CONFIDENCE else "")
+            name = f"adaptive, until {threshold:g}" + (" (the default)" if threshold == ENOUGH_AGREEMENT else "")
             lines.append(
                 line(
                     name,

@@ -2,6 +2,7 @@
 
 from robust_instant_policy.context.factorised import FactorisedPrompt
 from robust_instant_policy.context.frames import Frame
+from robust_instant_policy.context.leave_one_out import leave_one_out
 from robust_instant_policy.context.prompt import Frames, Layout, Order, Prompt
 from robust_instant_policy.context.sequence import SequencePrompt
 from robust_instant_policy.context.writing import write_prompt
@@ -14,5 +15,6 @@ __all__ = [
     "Order",
     "Prompt",
     "SequencePrompt",
+    "leave_one_out",
     "write_prompt",
 ]

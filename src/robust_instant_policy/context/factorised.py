@@ -134,12 +134,12 @@ def _question(arm: int, steps: Sequence[int], offsets: FloatArray, shown: FloatA
     rows = np.stack([whole[:, step, dim] for step, dim in asked], axis=1)
     digits = tuple(max(1, len(str(round(1.5 * largest[step, dim])))) for step, dim in asked)
     seen = shown[:, steps[0], arm]
-    inputs = _informative_inputs(seen, rows)
+    inputs = informative_inputs(seen, rows)
     examples = tuple(_input(points, inputs) + write_row(row) + "\n" for points, row in zip(seen, rows, strict=True))
     return Question(arm, steps[0], asked, digits, inputs, examples)
 
 
-def _informative_inputs(shown: FloatArray, outputs: FloatArray) -> tuple[int, ...]:
+def informative_inputs(shown: FloatArray, outputs: FloatArray) -> tuple[int, ...]:
     """The `INPUTS_PER_QUERY` of ``shown (I, 3·K)`` keypoint coordinates that explain most of ``outputs (I, D)``, by
     orthogonal matching pursuit."""
     inputs = shown - shown.mean(axis=0)

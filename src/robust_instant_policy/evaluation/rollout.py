@@ -17,6 +17,7 @@ from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import ClosedLoopPolicy, LocatedScene, Plan
+from robust_instant_policy.sanity import GeometryError
 from robust_instant_policy.tasks.task import Execution, FrameSink, Task
 from robust_instant_policy.trajectory import Trajectory
 
@@ -51,7 +52,7 @@ def roll_out(
     start = time.perf_counter()
     try:
         plan = policy.plan(observation)
-    except (KeypointError, PlanningError) as error:
+    except (GeometryError, KeypointError, PlanningError) as error:
         yield row(
             candidate=0,
             candidates=1,

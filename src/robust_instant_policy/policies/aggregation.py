@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.errors import InvalidValueError, PlanningError
-from robust_instant_policy.policies.confidence import Evidence, plan_confidence
+from robust_instant_policy.policies.confidence import Evidence, novelty, plan_confidence
 from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.policy import Plan, Stage, Stopwatch, Usage
 from robust_instant_policy.policies.sampling import Proposal
@@ -25,9 +25,7 @@ def aggregate(context: Context, scene: LocatedScene, proposal: Proposal, setting
     watch = Stopwatch()
     with watch.stage("regression"):
         robust = agree(proposal, settings, context.prompt.curvature, context.prompt.variation)
-    # Checks of the trajectory against the demonstrations belong here; what they find is evidence, too.
-    evidence = Evidence(robust.confidence, scene.located.confidence)
-    return make_plan(context, scene, proposal, robust, plan_confidence(evidence), watch.stages)
+    return make_plan(context, scene, proposal, robust, watch.stages, judged=True)
 
 
 def take_first(context: Context, scene: LocatedScene, proposal: Proposal) -> Plan:
@@ -44,7 +42,7 @@ def take_first(context: Context, scene: LocatedScene, proposal: Proposal) -> Pla
         dimensions=((),) * count,
         confidence=0.0,
     )
-    return make_plan(context, scene, proposal, alone, None)
+    return make_plan(context, scene, proposal, alone)
 
 
 def agree(
@@ -73,22 +71,36 @@ def make_plan(
     scene: LocatedScene,
     proposal: Proposal,
     chosen: RobustTrajectory,
-    confidence: float | None,
     stages: Sequence[Stage] = (),
+    judged: bool = False,
 ) -> Plan:
-    """The whole `Plan` that follows ``chosen``; ``stages`` are those after the candidates were made."""
+    """The whole `Plan` that follows ``chosen``; ``stages`` are those after the candidates were made.
+
+    Its trajectory is compared with what was demonstrated. It has a confidence where it is ``judged``: where ``chosen``
+    is what several candidates agree on.
+    """
+    trajectory = Trajectory(chosen.actions, chosen.times)
+    outside = context.report.envelope.check(trajectory) if context.report.envelope is not None else ()
+    evidence = Evidence.of(
+        chosen.confidence,
+        scene.located.confidence,
+        context.prediction_errors,
+        novelty(context.keypoints, scene.keypoints),
+        (*context.report.findings, *scene.findings, *outside),
+    )
     return Plan(
-        trajectory=Trajectory(chosen.actions, chosen.times),
+        trajectory=trajectory,
         candidates=proposal.candidates,
         weights=chosen.weights,
         scale=chosen.scale,
         hallucinated=chosen.hallucinated,
         onset=chosen.onset,
         scores=chosen.scores,
-        confidence=confidence,
+        confidence=plan_confidence(evidence) if judged else None,
+        evidence={name: value for name, value in vars(evidence).items() if np.isfinite(value)} if judged else {},
         keypoints=scene.located.keypoints,
         pixels=scene.located.pixels,
         keypoint_confidence=scene.located.confidence,
         usage=Usage((scene.stage, *proposal.stages, *stages)),
-        notes=(*context.notes, *scene.notes, *proposal.notes),
+        notes=(*context.notes, *scene.notes, *proposal.notes, *map(str, outside)),
     )

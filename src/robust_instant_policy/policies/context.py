@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from robust_instant_policy.context import Prompt, write_prompt
+from robust_instant_policy.context import Prompt, leave_one_out, write_prompt
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.geometry import FloatArray
@@ -13,6 +13,7 @@ from robust_instant_policy.perception import KeypointExtractor, Located
 from robust_instant_policy.policies.confidence import recognition
 from robust_instant_policy.policies.policy import Progress, Stage, Stopwatch, no_progress
 from robust_instant_policy.policies.settings import Settings
+from robust_instant_policy.sanity import Finding, SetReport, check_demonstrations
 from robust_instant_policy.trajectory import Trajectory, downsample
 
 HARDLY_RECOGNISED = "the scene was hardly recognised; is everything there that was there in the demonstrations?"
@@ -23,7 +24,8 @@ class Context:
     """What every method over keypoints starts from, made from ``demonstrations``.
 
     ``keypoints (I, K, 3)``, metres, world, and ``pixels (I, K, 2)`` (u, v) of the I demonstrations; their downsampled
-    ``trajectories``; the ``prompt`` that serialises both; ``notes`` for the user, one line each.
+    ``trajectories``; the ``prompt`` that serialises both; the ``report`` of what was checked; ``prediction_errors
+    (I, S)`` in metres, see `leave_one_out`; ``notes`` for the user, one line each.
     """
 
     demonstrations: tuple[Demonstration, ...]
@@ -32,15 +34,18 @@ class Context:
     pixels: FloatArray
     trajectories: tuple[Trajectory, ...]
     prompt: Prompt
+    report: SetReport
+    prediction_errors: FloatArray
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class LocatedScene:
-    """What was recognised in one observation, and what that cost."""
+    """What was recognised in one observation, what its checks found, and what both cost."""
 
     located: Located
     stage: Stage
+    findings: tuple[Finding, ...] = ()
 
     @property
     def keypoints(self) -> FloatArray:
@@ -50,21 +55,22 @@ class LocatedScene:
     @property
     def notes(self) -> tuple[str, ...]:
         """For the user, one line each."""
-        if recognition(self.located.confidence) < 1:
-            return (*self.located.notes, HARDLY_RECOGNISED)
-        return self.located.notes
+        hardly = (HARDLY_RECOGNISED,) if recognition(self.located.confidence) < 1 else ()
+        return (*map(str, self.findings), *self.located.notes, *hardly)
 
 
 def build_context(
     demonstrations: Sequence[Demonstration], settings: Settings, progress: Progress = no_progress
 ) -> Context:
-    """Find the keypoints that ``demonstrations`` share and serialise them.
+    """Check ``demonstrations``, find the keypoints that they share and serialise them.
 
-    Raises `DatasetError` without demonstrations, `KeypointError` where images have too little in common.
+    Raises `DatasetError` without demonstrations, `GeometryError` or `DemonstrationError` where they contradict
+    themselves (`check_demonstrations`), and `KeypointError` where images have too little in common.
     """
     if not demonstrations:
         raise DatasetError("no demonstrations; show the task at least once (rip record)")
-    # Checks of the demonstrations, as a set and against their images, belong here.
+    report = check_demonstrations(demonstrations)
+    report.raise_if_wrong()
     progress("keypoints", 0, 0)
     extractor = KeypointExtractor(
         settings.num_keypoints, settings.features, workspace=settings.workspace, seed=settings.seed
@@ -81,15 +87,20 @@ def build_context(
         extractor.pixels_,
         trajectories,
         prompt,
-        extractor.notes_,
+        report,
+        leave_one_out(extractor.keypoints_, trajectories, prompt.frames if settings.frames == "adaptive" else None),
+        (*extractor.notes_, *report.notes),
     )
 
 
 def locate(context: Context, observation: Observation, progress: Progress = no_progress) -> LocatedScene:
-    """Find the keypoints in ``observation``. Raises `KeypointError` where the scene cannot be recognised."""
-    # Checks of the observation against the demonstrations belong here.
+    """Check ``observation`` against the demonstrations and find the keypoints in it.
+
+    Raises `GeometryError` where it contradicts them and `KeypointError` where the scene cannot be recognised.
+    """
     progress("keypoints", 0, 0)
     watch = Stopwatch()
     with watch.stage("keypoints"):
+        findings = context.report.require_observation(observation)
         located = context.extractor.locate(observation)
-    return LocatedScene(located, watch.stages[0])
+    return LocatedScene(located, watch.stages[0], findings)

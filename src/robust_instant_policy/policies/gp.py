@@ -101,4 +101,4 @@ class KeypointRegression(KeypointPolicy):
         regression = Stopwatch()
         with regression.stage("regression"):  # of one candidate: a rigid gripper, open or closed
             rigid = replace(agree(proposal, self.settings), scale=np.full(self._shape, deviation[0]))
-        return make_plan(self.context_, scene, proposal, rigid, None, regression.stages)
+        return make_plan(self.context_, scene, proposal, rigid, regression.stages)

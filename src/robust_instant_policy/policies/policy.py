@@ -6,7 +6,7 @@ import json
 import math
 import reprlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,7 +85,9 @@ class Plan:
     its gripper state, the tenth column, the weighted share of candidates with the other state, in [0, 1].
     ``hallucinated (Q,)`` names the candidates that leave the agreement, ``onset (Q,)`` the first step, of the
     candidate's own, at which each does (-1: never), and ``scores (Q,)`` how strong the evidence is.
-    ``confidence`` in [0, 1] is the number to gate on, None from a method that has none.
+    ``confidence`` is the number to gate on: a calibrated probability in [0, 1] that the plan is right (docs/trust.md),
+    0 where a check found an error; None from a method that has none. ``evidence`` is what it was made from, see
+    `confidence.Evidence`.
     ``keypoints (K, 3)``, metres, world, ``pixels (K, 2)`` (u, v) and ``keypoint_confidence (K,)`` in [0, 1] are what
     was recognised; ``notes`` are for the user, one line each.
     """
@@ -103,6 +105,7 @@ class Plan:
     keypoint_confidence: FloatArray
     usage: Usage = field(default_factory=Usage)
     notes: tuple[str, ...] = ()
+    evidence: Mapping[str, float] = field(default_factory=dict)
 
     def save(self, path: str | Path) -> None:
         """Write the plan as JSON, whole or not at all. Raises `DatasetError` when that is not possible."""
@@ -114,6 +117,7 @@ class Plan:
             "confidence": self.confidence,
             "usage": [vars(stage) for stage in self.usage.stages],
             "notes": list(self.notes),
+            "evidence": dict(self.evidence),
         }
         write_whole(Path(path), (json.dumps(content, allow_nan=False) + "\n").encode())
 
@@ -137,6 +141,7 @@ class Plan:
                 confidence=_checked_confidence(content["confidence"]),
                 usage=Usage(tuple(_stage(stage) for stage in content["usage"])),
                 notes=_checked_notes(content["notes"]),
+                evidence=_checked_evidence(content.get("evidence", {})),  # plans of version 0.1 have none
                 **{name: _array(content, name, sizes) for name in _ARRAYS},
             )
         except OSError as error:
@@ -177,6 +182,12 @@ def _stage(content: dict) -> Stage:
     ):
         raise ValueError("its usage holds something other than a name and what a stage cost")
     return stage
+
+
+def _checked_evidence(value: object) -> dict[str, float]:
+    if not isinstance(value, dict) or not all(isinstance(v, int | float) and math.isfinite(v) for v in value.values()):
+        raise ValueError("its evidence is not a map of numbers")
+    return {name: float(number) for name, number in value.items()}
 
 
 def _checked_notes(notes: object) -> tuple[str, ...]:

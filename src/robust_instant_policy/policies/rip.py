@@ -12,7 +12,7 @@ from robust_instant_policy.policies.policy import Plan
 from robust_instant_policy.policies.sampling import MIN_CANDIDATES, Samples, count_candidates, propose
 from robust_instant_policy.trajectory import Trajectory
 
-ENOUGH_CONFIDENCE = 0.3  # with adaptive queries, no more are asked above it (chosen in docs/prompts.md)
+ENOUGH_AGREEMENT = 0.3  # with adaptive queries, no more are asked above it (chosen in docs/prompts.md)
 
 
 class RobustInstantPolicy(KeypointActionTokens):
@@ -36,8 +36,8 @@ class RobustInstantPolicy(KeypointActionTokens):
             if enough or queries == most:
                 plan = aggregate(self.context_, scene, propose(self.context_, scene, samples, queries), settings)
                 # More samples do not show the scene better: what is enough depends on how well it was recognised.
-                threshold = ENOUGH_CONFIDENCE * recognition(plan.keypoint_confidence)
-                if queries == most or (plan.confidence or 0.0) >= threshold:
+                threshold = ENOUGH_AGREEMENT * recognition(plan.keypoint_confidence)
+                if queries == most or plan.evidence["agreement"] >= threshold:
                     return plan, samples
             queries += 1
             samples = self.sample(scene, samples, queries)

@@ -31,7 +31,7 @@ class Settings:
     Keypoints: ``num_keypoints`` K; ``features`` names the image descriptors; ``workspace ((x, y, z), (x, y, z))`` are
     the lower and upper corner of what is looked at, metres, world. Trajectories: ``downsampling`` "masked" or "uniform"
     to ``num_steps`` steps. Prompt: ``frames`` and ``layout``, see `write_prompt`. Samples: ``num_queries`` Q at
-    ``temperature``; with ``adaptive``, three at first and up to Q while the plan's confidence is low. Aggregation:
+    ``temperature``; with ``adaptive``, three at first and up to Q while the candidates agree little. Aggregation:
     ``dof`` ν, infinity for the Gaussian ablation; ``estimator``, see `robust_gripper_trajectory`. ``seed`` is that of
     the keypoints, the samples and the networks.
     """

@@ -1,0 +1,297 @@
+"""Is `Plan.confidence` the probability that a plan is right? Sound and faulty scenes, planned for and executed.
+
+    python benchmarks/confidence.py run --out runs/confidence            # resumable; hours for all faults
+    python benchmarks/confidence.py run --out runs/confidence --faults none shuffled:demos --tasks push-cube
+    python benchmarks/confidence.py fit runs/confidence                  # coefficients from the tuning rows
+    python benchmarks/confidence.py report runs/confidence               # table and diagram from the others
+
+A row is what a user would see: refused while fitting or planning, or a plan with its confidence and whether it succeeds
+in the simulator. Faults are those of `benchmarks/faults.py`. Plans are made with `stand_in.StandIn`, no language model:
+its answers agree (``--spread 0``) or are drawn from bootstraps of the prompt's examples (``--spread 1``).
+
+Demonstrations and scenes of the two splits share no seed: "tune" is for `fit`, "test" for `report`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from faults import FAULTS, Fault
+from rich.progress import track
+from scipy.optimize import minimize
+from stand_in import StandIn
+
+from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import KeypointError, PlanningError, RipError, UnreachableError
+from robust_instant_policy.evaluation.statistics import wilson_interval
+from robust_instant_policy.policies import RobustInstantPolicy
+from robust_instant_policy.policies.confidence import COEFFICIENTS, Evidence
+from robust_instant_policy.sanity import DemonstrationError, GeometryError
+from robust_instant_policy.tasks import TASK_NAMES, make_task
+from robust_instant_policy.tasks.camera_noise import CameraNoise
+from robust_instant_policy.tasks.record import record
+
+TABLES = Path(__file__).parent.parent / "docs" / "tables"
+SPLITS = {"tune": (700_000, 710_000), "test": (720_000, 730_000)}  # first seeds of demonstrations and of new scenes
+NUM_DEMOS = 10
+GATE = 0.9
+NAMES = [field.name for field in fields(Evidence)]
+REFUSALS = (GeometryError, DemonstrationError, KeypointError, PlanningError, UnreachableError)
+Row = dict[str, Any]
+
+
+def demonstrations(folder: Path, task: Any, first_seed: int) -> list[Demonstration]:
+    from robust_instant_policy.datasets import DatasetWriter
+
+    with DatasetWriter(folder, task=task.name, description=task.description, rate_hz=task.record_hz) as writer:
+        record(task, writer, NUM_DEMOS, seed=first_seed)
+    return load_demonstrations(folder, limit=NUM_DEMOS)
+
+
+def keep(rows: Path, row: Row) -> None:
+    with rows.open("a") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def cases(options: argparse.Namespace) -> list[tuple[str, str, str]]:
+    """(split, fault, camera) in an order that covers every fault early."""
+    names = options.faults or ["none", *FAULTS]
+    found = [(split, name, camera) for name in names for split in options.splits for camera in options.cameras]
+    if options.share < 1:  # the same part of the faults for the same task, whatever else is asked for
+        found = [case for case in found if case[1] == "none" or zlib.crc32(repr(case).encode()) / 2**32 < options.share]
+    return found
+
+
+def run(options: argparse.Namespace) -> None:
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name in options.tasks:
+        rows = options.out / f"{name}.jsonl"
+        done = {key(row) for row in read(rows)}
+        task: Any = make_task(name)
+        try:
+            shown = {
+                split: demonstrations(options.out / "data" / f"{name}-{split}", task, SPLITS[split][0])
+                for split in options.splits
+            }
+            for split, fault, camera in track(cases(options), description=name):
+                wanted = range(options.scenes * (options.sound if fault == "none" else 1))
+                left = [index for index in wanted if (name, split, fault, camera, index, options.spread) not in done]
+                if left:
+                    for row in examine(task, shown[split], split, fault, camera, left, options.spread):
+                        keep(rows, row)
+        finally:
+            task.close()
+
+
+def key(row: Row) -> tuple:
+    return tuple(row[name] for name in ("task", "split", "fault", "camera", "scene", "spread"))
+
+
+def examine(
+    task: Any, shown: Sequence[Demonstration], split: str, name: str, camera: str, scenes: Sequence[int], spread: float
+) -> Iterator[Row]:
+    """One row a scene: refused, or planned and executed."""
+    fault = FAULTS.get(name, Fault("none", ()))
+    noise = CameraNoise() if camera == "noisy" else None
+
+    def photograph(observation: Observation, seed: int) -> Observation:
+        return observation if noise is None else noise.photograph(observation, seed)
+
+    base: Row = {"task": task.name, "split": split, "fault": name, "camera": camera, "spread": spread}
+    policy = RobustInstantPolicy(StandIn(spread), workspace=task.workspace)
+    seen = [replace(d, observation=photograph(d.observation, i)) for i, d in enumerate(shown)]
+    try:
+        policy.fit(seen if fault.demonstrations is None else fault.demonstrations(seen))
+    except RipError as error:
+        for index in scenes:
+            yield {**base, "scene": index, "outcome": refusal("fit", error), "confidence": 0.0, "why": str(error)}
+        return
+    for index in scenes:
+        seed = SPLITS[split][1] + index
+        row = {**base, "scene": index}
+        observation = photograph(task.reset(seed), seed)
+        try:
+            plan = policy.plan(observation if fault.scene is None else fault.scene(observation, seen))
+        except RipError as error:
+            yield {**row, "outcome": refusal("plan", error), "confidence": 0.0, "why": str(error)}
+            continue
+        trajectory = plan.trajectory
+        if fault.plan is not None:
+            trajectory = fault.plan(trajectory)
+            outside = policy.context_.report.envelope.check(trajectory)
+            plan = replace(plan, confidence=0.0 if outside else plan.confidence, notes=tuple(map(str, outside)))
+        try:
+            execution = task.execute(trajectory)
+            outcome, why = ("success", "") if execution.success else ("failure", execution.failure)
+        except UnreachableError as error:
+            outcome, why = "failure", str(error)
+        evidence = {name: round(float(value), 5) for name, value in plan.evidence.items()}
+        notes = [note for note in plan.notes if not note.startswith("features")]
+        yield {
+            **row,
+            "outcome": outcome,
+            "confidence": plan.confidence,
+            "why": why,
+            "evidence": evidence,
+            "notes": notes,
+        }
+
+
+def refusal(stage: str, error: RipError) -> str:
+    if not isinstance(error, REFUSALS):
+        print(f"  {type(error).__name__} while {stage}: {error}", file=sys.stderr)
+    return f"refused at {stage}"
+
+
+def read(path: Path) -> list[Row]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def all_rows(folder: Path, split: str) -> list[Row]:
+    return [row for path in sorted(folder.glob("*.jsonl")) for row in read(path) if row["split"] == split]
+
+
+def executed(rows: Sequence[Row]) -> list[Row]:
+    """The rows in which a plan was made and every check was passed."""
+    return [row for row in rows if row["outcome"] in ("success", "failure")]
+
+
+def fit(options: argparse.Namespace) -> None:
+    """Maximum likelihood over the tuning rows, coefficients not negative; then each task left out in turn."""
+    rows = [row for row in executed(all_rows(options.folder, "tune")) if row["confidence"] > 0]
+    names = [name for name in COEFFICIENTS if name != "constant"]
+    found = [Evidence(**{name: row["evidence"].get(name, np.nan) for name in NAMES}).features() for row in rows]
+    features = np.array([[1.0, *(values[name] for name in names)] for values in found])
+    right = np.array([row["outcome"] == "success" for row in rows])
+    # Each task weighs the same, and so do its successes and failures as they come.
+    tasks = np.array([row["task"] for row in rows])
+
+    def solve(chosen: np.ndarray) -> np.ndarray:
+        def loss(b: np.ndarray) -> float:
+            score = features[chosen] @ b
+            return float(np.logaddexp(0, np.where(right[chosen], -score, score)).mean() + 1e-3 * (b[1:] ** 2).sum())
+
+        bounds = [(None, None)] + [(0, None)] * len(names)
+        return minimize(loss, np.ones(len(names) + 1), bounds=bounds).x
+
+    best = solve(np.ones(len(rows), dtype=bool))
+    print(f"{len(rows)} plans, {right.mean():.1%} right")
+    print("COEFFICIENTS =", {name: round(float(b), 2) for name, b in zip(["constant", *names], best, strict=True)})
+    for task in sorted(set(tasks)):
+        left = tasks == task
+        b = solve(~left)
+        p = 1 / (1 + np.exp(-features[left] @ b))
+        passed = p >= GATE
+        print(
+            f"  without {task:<20} right {right[left].mean():.2f}, mean confidence {p.mean():.2f}, "
+            f"passing {passed.mean():.2f}, of these right {right[left][passed].mean() if passed.any() else np.nan:.2f}"
+        )
+
+
+def auroc(confidence: np.ndarray, right: np.ndarray) -> float:
+    """Probability that a success has more confidence than a failure; ties count half."""
+    good, bad = confidence[right][:, None], confidence[~right]
+    return float(((good > bad) + 0.5 * (good == bad)).mean()) if good.size and bad.size else float("nan")
+
+
+def summary(rows: Sequence[Row]) -> dict[str, str]:
+    made = executed(rows)
+    confidence = np.array([row["confidence"] for row in made])
+    right = np.array([row["outcome"] == "success" for row in made], dtype=bool)
+    passed = confidence >= GATE
+    wrong, through = int((passed & ~right).sum()), int(passed.sum())
+    low, high = wilson_interval(wrong, through)
+    return {
+        "cases": f"{len(rows)}",
+        "refused": f"{len(rows) - len(made)}",
+        "plans, right": f"{len(made)}, {int(right.sum())}",
+        "right ones that pass": f"{passed[right].mean():.0%}" if right.any() else "–",
+        "wrong among those that pass": f"{wrong} of {through}: {wrong / max(through, 1):.1%} ({low:.1%} to {high:.1%})",
+        "AUROC": f"{auroc(confidence, right):.3f}",
+    }
+
+
+def report(options: argparse.Namespace) -> None:
+    rows = all_rows(options.folder, options.split)
+    sound = [row for row in rows if row["fault"] == "none"]
+    parts = {
+        "sound scenes, usual camera": [row for row in sound if row["camera"] == "usual"],
+        "sound scenes, noisy camera": [row for row in sound if row["camera"] == "noisy"],
+        "faults": [row for row in rows if row["fault"] != "none"],
+        "all": rows,
+    }
+    parts |= {f"all, {task}": [row for row in rows if row["task"] == task] for task in TASK_NAMES}
+    columns = list(summary(rows))
+    lines = ["| | " + " | ".join(columns) + " |", "| --- " * (len(columns) + 1) + "|"]
+    lines += [f"| {name} | " + " | ".join(summary(part).values()) + " |" for name, part in parts.items() if part]
+    text = "\n".join(lines)
+    print(text)
+    print("\nwrong plans that pass:")
+    for row in executed(rows):
+        if row["confidence"] >= GATE and row["outcome"] == "failure":
+            print(f"  {row['task']} {row['fault']} {row['camera']} {row['confidence']:.2f}: {row['why']}")
+    if options.write:
+        (TABLES / "confidence.md").write_text(text + "\n")
+        draw(executed(rows), TABLES.parent / "images" / "confidence.svg")
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Reliability diagram: the share of right plans against their confidence, with Wilson's 95% intervals."""
+    import matplotlib.pyplot as plt
+
+    confidence = np.array([row["confidence"] for row in rows])
+    right = np.array([row["outcome"] == "success" for row in rows], dtype=bool)
+    edges = np.array([0, 1e-9, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 1.0 + 1e-9])
+    figure, (top, bottom) = plt.subplots(2, 1, figsize=(5, 6), height_ratios=(3, 1), sharex=True, layout="constrained")
+    top.plot([0, 1], [0, 1], color="0.7", linewidth=1)
+    for low, high in pairwise(edges):
+        inside = (confidence >= low) & (confidence < high)
+        if inside.any():
+            share, (least, most) = right[inside].mean(), wilson_interval(int(right[inside].sum()), int(inside.sum()))
+            top.errorbar(confidence[inside].mean(), share, [[share - least], [most - share]], fmt="o", color="C0")
+            top.annotate(f" {int(inside.sum())}", (confidence[inside].mean(), share), fontsize=8)
+    top.set(ylabel="share of plans that succeed", ylim=(-0.02, 1.02))
+    bottom.hist([confidence[right], confidence[~right]], bins=20, range=(0, 1), stacked=True, label=["right", "wrong"])
+    bottom.set(xlabel="confidence", ylabel="plans", yscale="log")
+    bottom.legend(fontsize=8)
+    figure.savefig(path, metadata={"Date": None})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    running = commands.add_parser("run")
+    running.add_argument("--out", type=Path, required=True)
+    running.add_argument("--tasks", nargs="+", default=list(TASK_NAMES))
+    running.add_argument("--faults", nargs="+", help="default: none and all of benchmarks/faults.py")
+    running.add_argument("--share", type=float, default=1.0, help="of the faults, chosen by their names")
+    running.add_argument("--scenes", type=int, default=2, help="new scenes for each fault")
+    running.add_argument("--sound", type=int, default=8, help="times as many where nothing is wrong")
+    running.add_argument("--splits", nargs="+", default=list(SPLITS), choices=SPLITS)
+    running.add_argument("--cameras", nargs="+", default=["usual", "noisy"], choices=["usual", "noisy"])
+    running.add_argument("--spread", type=float, default=0.0)
+    running.set_defaults(run=run)
+    fitting = commands.add_parser("fit")
+    fitting.add_argument("folder", type=Path)
+    fitting.set_defaults(run=fit)
+    reporting = commands.add_parser("report")
+    reporting.add_argument("folder", type=Path)
+    reporting.add_argument("--split", default="test", choices=SPLITS)
+    reporting.add_argument("--write", action="store_true", help="into docs/")
+    reporting.set_defaults(run=report)
+    options = parser.parse_args()
+    options.run(options)
+
+
+if __name__ == "__main__":
+    main()
