@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 from pick_and_place import WITHIN_M, PickAndPlace, Scene, key_error
-from prompting import DOF, FIRST_NEW_SEED, NUM_DEMOS, fitted
+from prompting import FIRST_NEW_SEED, NUM_DEMOS, fitted
 
 from robust_instant_policy.llm import Listener, RecordedModel, SampleStore, Sampling, connect
 from robust_instant_policy.policies.rip import ENOUGH_CONFIDENCE, FIRST_QUERIES
@@ -83,7 +83,7 @@ def sampled(scenes: int) -> list[Sampled]:
 
 
 def planned(scene: Scene, candidates: Sequence[Trajectory], bends: np.ndarray) -> Planned:
-    robust = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=DOF, bends=bends)
+    robust = robust_gripper_trajectory([candidate.actions for candidate in candidates], curvature=bends)
     return Planned(key_error(Trajectory.from_actions(robust.actions), scene.trajectory), robust.confidence)
 
 

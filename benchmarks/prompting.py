@@ -29,7 +29,7 @@ from robust_instant_policy.context.prompt import Frames, Layout, Order
 from robust_instant_policy.errors import ModelError
 from robust_instant_policy.llm import LanguageModel, Listener, Sampling, connect
 from robust_instant_policy.query import Query
-from robust_instant_policy.regression import robust_gripper_trajectory
+from robust_instant_policy.regression import DEFAULT_DOF, robust_gripper_trajectory
 from robust_instant_policy.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[1]
@@ -37,7 +37,6 @@ KEPT, TABLE = ROOT / "results" / "prompting.jsonl", ROOT / "docs" / "tables" / "
 NUM_DEMOS = 10
 NUM_SAMPLES = 5  # Q
 MIN_CANDIDATES = 3
-DOF = 1.5
 FIRST_NEW_SEED = 1000  # demonstrations count from 0
 
 
@@ -114,7 +113,7 @@ class Measurement:
             cold=self._cold,
             single=(*single, *[float("inf")] * (NUM_SAMPLES - len(single))),
             gaussian=agreed_error(candidates, scene, float("inf"), self._prompt.bends_),
-            robust=agreed_error(candidates, scene, DOF, self._prompt.bends_),
+            robust=agreed_error(candidates, scene, DEFAULT_DOF, self._prompt.bends_),
             refused=counts[False],
             answers=counts.total(),
             tokens=sum(one.prompt_tokens - one.cached_tokens + one.completion_tokens for one in every),
@@ -147,7 +146,7 @@ def fitted(demos: Sequence[Scene], frames: Frames, layout: Layout, order: Order)
 def agreed_error(candidates: Sequence[Trajectory], scene: Scene, dof: float, bends: np.ndarray) -> float:
     if len(candidates) < MIN_CANDIDATES:
         return float("inf")
-    fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof, bends=bends)
+    fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof, curvature=bends)
     return key_error(Trajectory.from_actions(fit.actions), scene.trajectory)
 
 

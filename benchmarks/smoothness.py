@@ -18,11 +18,12 @@ from stored_proposals import NUM_DEMOS, arguments, proposals
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.instant import Proposal
-from robust_instant_policy.policies.rip import DOF, robust_plan
+from robust_instant_policy.policies.rip import robust_plan
+from robust_instant_policy.regression import DEFAULT_DOF
 from robust_instant_policy.reporting.tables import Table
 from robust_instant_policy.trajectory import Trajectory
 
-COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, bends unknown", "robust")
+COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, curvature unknown", "robust")
 
 
 def sharpest_turn(trajectory: Trajectory) -> float:
@@ -32,10 +33,14 @@ def sharpest_turn(trajectory: Trajectory) -> float:
 
 
 def turns(proposal: Proposal) -> tuple[list[float], float]:
-    """The sharpest turns in the order of `COLUMNS` but the first, and what knowing the bends moves at key steps."""
+    """The sharpest turns in the order of `COLUMNS` but the first, and what knowing the curvature moves at key steps."""
     gaussian, free, robust = (
         robust_plan(candidates, dof).trajectory
-        for candidates, dof in ((proposal, np.inf), (replace(proposal, bends=None), DOF), (proposal, DOF))
+        for candidates, dof in (
+            (proposal, np.inf),
+            (replace(proposal, bends=None), DEFAULT_DOF),
+            (proposal, DEFAULT_DOF),
+        )
     )
     paths = (proposal.candidates[0], gaussian, free, robust)
     return [sharpest_turn(path) for path in paths], key_error(robust, free)
