@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 RIP := .venv/bin/rip
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test coverage lint clean
 
 setup:
 	@scripts/setup.sh
@@ -11,13 +11,20 @@ setup:
 demo: setup
 	@$(RIP) demo $(ARGS)
 
-lint: setup
+# Installs nothing.
+lint:
+	@[ -x .venv/bin/ruff ] && [ -x .venv/bin/mypy ] || { echo "the linters are not installed; run: make setup" >&2; exit 1; }
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
-test: lint
+test: setup
+	@$(MAKE) --no-print-directory lint
 	.venv/bin/python -m pytest $(ARGS)
 
+# The tests, with the share of lines that they run: 11 to 33% more processor time on Python 3.11.
+coverage:
+	@$(MAKE) --no-print-directory test ARGS="--cov --cov-report=term:skip-covered $(ARGS)"
+
 clean:
-	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage

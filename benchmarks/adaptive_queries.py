@@ -20,10 +20,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 from pick_and_place import WITHIN_M, PickAndPlace, Scene, key_error
-from prompting import DOF, FIRST_NEW_SEED, NUM_DEMOS, fitted
+from prompting import FIRST_NEW_SEED, NUM_DEMOS, fitted
 
 from robust_instant_policy.llm import Listener, RecordedModel, SampleStore, Sampling, connect
-from robust_instant_policy.policies.rip import ENOUGH_CONFIDENCE, FIRST_QUERIES
+from robust_instant_policy.policies.rip import ENOUGH_CONFIDENCE
+from robust_instant_policy.policies.sampling import MIN_CANDIDATES as FIRST_QUERIES
 from robust_instant_policy.regression import robust_gripper_trajectory
 from robust_instant_policy.trajectory import Trajectory
 
@@ -62,19 +63,19 @@ def sampled(scenes: int) -> list[Sampled]:
     for number in range(scenes):
         scene = world.scene(FIRST_NEW_SEED + number, exact=True)
         sampling = Sampling(MOST, TEMPERATURE, seed=number, deadline_s=600.0)
-        answers = model.sample(prompt.queries(scene.keypoints), sampling, Listener(prompt.accepts))
-        texts = [[of_query[index].text for of_query in answers] for index in range(min(map(len, answers)))]
+        answers = model.sample(prompt.queries(scene.keypoints), sampling, Listener(prompt.read))
+        values = [[of_query[index].value for of_query in answers] for index in range(min(map(len, answers)))]
         costs = [
             sum(a.prompt_tokens - a.cached_tokens + a.completion_tokens for a in (q[index] for q in answers))
-            for index in range(len(texts))
+            for index in range(len(values))
         ]
         result.append(
             Sampled(
                 scene,
-                [prompt.trajectory(text, scene.keypoints) for text in texts],
-                [prompt.trajectory(text, demo.keypoints) for text, demo in zip(texts, demos, strict=False)],
+                [prompt.trajectory(read, scene.keypoints) for read in values],
+                [prompt.trajectory(read, demo.keypoints) for read, demo in zip(values, demos, strict=False)],
                 costs,
-                prompt.bends_,
+                prompt.curvature,
             )
         )
         print(f"scene {number + 1} of {scenes}", flush=True)
@@ -83,7 +84,7 @@ def sampled(scenes: int) -> list[Sampled]:
 
 
 def planned(scene: Scene, candidates: Sequence[Trajectory], bends: np.ndarray) -> Planned:
-    robust = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=DOF, bends=bends)
+    robust = robust_gripper_trajectory([candidate.actions for candidate in candidates], curvature=bends)
     return Planned(key_error(Trajectory.from_actions(robust.actions), scene.trajectory), robust.confidence)
 
 

@@ -15,7 +15,7 @@ from collections import defaultdict
 from pathlib import Path
 from statistics import median
 
-from robust_instant_policy.evaluation import Episode, open_episodes, wilson_interval
+from robust_instant_policy.evaluation import Episode, read_results, wilson_interval
 from robust_instant_policy.evaluation.episodes import EpisodeKey
 from robust_instant_policy.policies import METHOD_NAMES
 from robust_instant_policy.policies.diffusion import checkpoint
@@ -33,7 +33,7 @@ def main() -> None:
     options = parser.parse_args()
     rows: dict[tuple, dict[EpisodeKey, Episode]] = defaultdict(dict)  # what two runs did counts once
     for run in options.runs:
-        for row in open_episodes(run).rows:
+        for row in read_results(run).episodes:
             if row.variant.steps is None and (row.variant.method not in UNTRAINED or row.variant.demos != DEMOS):
                 continue
             rows[row.scene.task, row.variant.demos, row.variant.method, row.variant.steps][row.key] = row

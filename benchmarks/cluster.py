@@ -14,7 +14,7 @@ import shutil
 import time
 from pathlib import Path
 
-from ray.cluster_utils import Cluster as LocalCluster
+from ray.cluster_utils import Cluster
 
 from robust_instant_policy.evaluation import (
     STORE_FILE,
@@ -23,13 +23,13 @@ from robust_instant_policy.evaluation import (
     Setup,
     Variant,
     make_suites,
-    open_episodes,
+    read_results,
     run_suites,
 )
-from robust_instant_policy.evaluation.cluster import Cluster
+from robust_instant_policy.evaluation.cluster import RayWorkers
 from robust_instant_policy.evaluation.episodes import Episode
-from robust_instant_policy.evaluation.processes import Processes
-from robust_instant_policy.evaluation.work import Hands
+from robust_instant_policy.evaluation.processes import LocalWorkers
+from robust_instant_policy.evaluation.work import Workers
 from robust_instant_policy.llm import model_name
 
 TIMES = ("seconds", "physics_seconds")
@@ -52,7 +52,7 @@ def main() -> None:
     scenes = len(suites[0].scenes)
     lines = ["| workers | scenes | rows | killed | complete | minutes |", "| --- | --- | --- | --- | --- | --- |"]
 
-    def run(name: str, hands: Hands, on_scene=lambda count: None) -> list[Episode]:
+    def run(name: str, workers: Workers, on_scene=lambda count: None) -> list[Episode]:
         out = options.out / name
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
@@ -69,16 +69,16 @@ def main() -> None:
             print(f"\r{name}: {done} of {total} plans", end="", flush=True)
 
         start = time.monotonic()
-        run_suites(suites, setup, out, hands, Progress(lambda *_: None, outcome))
+        run_suites(suites, setup, out, workers, Progress(outcome=outcome))
         print()
-        rows = open_episodes(out).rows
+        rows = list(read_results(out).episodes)
         complete = len({row.scene for row in rows}) == scenes
         minutes = (time.monotonic() - start) / 60
         killed = f"one node after {scenes // 2} scenes" if name == "cluster" else "none"
         lines.append(f"| {name} | {scenes} | {len(rows)} | {killed} | {'yes' if complete else 'no'} | {minutes:.1f} |")
         return rows
 
-    cluster = LocalCluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     second = [cluster.add_node(num_cpus=1)]
     cluster.wait_for_nodes()
 
@@ -88,10 +88,10 @@ def main() -> None:
             cluster.remove_node(second.pop(), allow_graceful=False)
 
     try:
-        over_nodes = run("cluster", Cluster(cluster.address, 2), kill_one)
+        over_nodes = run("cluster", RayWorkers(cluster.address, 2), kill_one)
     finally:
         cluster.shutdown()
-    here = run("processes", Processes(2))
+    here = run("processes", LocalWorkers(2))
     same = {row.key: _timeless(row) for row in over_nodes} == {row.key: _timeless(row) for row in here}
     lines.append("")
     lines.append(f"Rows of both equal up to order and times: {'yes' if same else 'no'}.")

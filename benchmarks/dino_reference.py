@@ -19,39 +19,30 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import transformers
 from torch import nn
 
 from robust_instant_policy.perception.settings import PAPER_REAL, PAPER_SIMULATION, DescriptorSettings
 from robust_instant_policy.perception.vit import VitDescriptors
-from robust_instant_policy.perception.vit_checkpoint import VitCheckpoint, VitConfig, expected_tensors
+from robust_instant_policy.perception.vit_checkpoint import VitCheckpoint
 
 TABLE = Path(__file__).parent.parent / "docs" / "tables" / "dino_reference.md"
 MIN_COSINE = 0.9999
 MAX_SALIENCY_DIFFERENCE = 1e-4
 COLUMNS = {"simulation": (PAPER_SIMULATION, (100, 100)), "real": (PAPER_REAL, (240, 320))}
-VIT_S8 = VitConfig(
-    model_type="vit",
-    hidden_size=384,
-    num_hidden_layers=12,
-    num_attention_heads=6,
-    patch_size=8,
-    num_positions=785,
-    num_register_tokens=0,
-    intermediate_size=1536,
-    layer_norm_eps=1e-6,
-    swiglu=False,
-    qkv_bias=True,
+VIT_S8 = transformers.ViTConfig(
+    hidden_size=384, num_hidden_layers=12, num_attention_heads=6, intermediate_size=1536, patch_size=8, image_size=224
 )
 
 
-def random_checkpoint(seed: int, config: VitConfig = VIT_S8) -> VitCheckpoint:
+def random_checkpoint(seed: int, config: transformers.ViTConfig = VIT_S8) -> VitCheckpoint:
     """Weights large enough that attention is far from uniform and descriptors differ between patches."""
     generator = torch.Generator().manual_seed(seed)
-    tensors = {}
-    for name, shape in expected_tensors(config).items():
-        noise = torch.randn(shape, generator=generator)
-        tensors[name] = 1 + 0.1 * noise if "norm" in name and name.endswith("weight") else 0.06 * noise
-    return VitCheckpoint(config, tensors)
+    model = transformers.ViTModel(config, add_pooling_layer=False).eval().requires_grad_(False)
+    for name, tensor in model.named_parameters():
+        noise = torch.randn(tensor.shape, generator=generator)
+        tensor.copy_(1 + 0.1 * noise if "norm" in name and name.endswith("weight") else 0.06 * noise)
+    return VitCheckpoint(model)
 
 
 class ReferenceAttention(nn.Module):
@@ -71,7 +62,7 @@ class ReferenceAttention(nn.Module):
 
 
 class ReferenceBlock(nn.Module):
-    def __init__(self, config: VitConfig):
+    def __init__(self, config: transformers.ViTConfig):
         super().__init__()
         width = config.hidden_size
         self.norm1, self.norm2 = (nn.LayerNorm(width, eps=config.layer_norm_eps) for _ in range(2))
@@ -90,7 +81,7 @@ class ReferenceTransformer(nn.Module):
 
     def __init__(self, checkpoint: VitCheckpoint):
         super().__init__()
-        config, tensors = checkpoint.config, checkpoint.tensors
+        config, tensors = checkpoint.model.config, checkpoint.model.state_dict()
         self.patch_embed = nn.Module()
         self.patch_embed.patch_size = config.patch_size
         self.patch_embed.proj = nn.Conv2d(3, config.hidden_size, config.patch_size, config.patch_size)
@@ -99,15 +90,15 @@ class ReferenceTransformer(nn.Module):
         for kind in ("weight", "bias"):
             renamed[f"patch_embed.proj.{kind}"] = tensors[f"embeddings.patch_embeddings.projection.{kind}"]
             for i in range(config.num_hidden_layers):
-                theirs, ours = f"blocks.{i}.", f"encoder.layer.{i}."
+                theirs, ours = f"blocks.{i}.", f"layers.{i}."
                 renamed[f"{theirs}attn.qkv.{kind}"] = torch.cat(
-                    [tensors[f"{ours}attention.attention.{facet}.{kind}"] for facet in ("query", "key", "value")]
+                    [tensors[f"{ours}attention.{facet}_proj.{kind}"] for facet in "qkv"]
                 )
-                renamed[f"{theirs}attn.proj.{kind}"] = tensors[f"{ours}attention.output.dense.{kind}"]
+                renamed[f"{theirs}attn.proj.{kind}"] = tensors[f"{ours}attention.o_proj.{kind}"]
                 renamed[f"{theirs}norm1.{kind}"] = tensors[f"{ours}layernorm_before.{kind}"]
                 renamed[f"{theirs}norm2.{kind}"] = tensors[f"{ours}layernorm_after.{kind}"]
-                renamed[f"{theirs}mlp.0.{kind}"] = tensors[f"{ours}intermediate.dense.{kind}"]
-                renamed[f"{theirs}mlp.2.{kind}"] = tensors[f"{ours}output.dense.{kind}"]
+                renamed[f"{theirs}mlp.0.{kind}"] = tensors[f"{ours}mlp.fc1.{kind}"]
+                renamed[f"{theirs}mlp.2.{kind}"] = tensors[f"{ours}mlp.fc2.{kind}"]
         self.load_state_dict(renamed)
         self.pos_embed = tensors["embeddings.position_embeddings"]
         self.cls_token = tensors["embeddings.cls_token"]

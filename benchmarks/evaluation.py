@@ -34,7 +34,7 @@ from robust_instant_policy.evaluation import (
     run_suites,
 )
 from robust_instant_policy.evaluation.episodes import Episode
-from robust_instant_policy.evaluation.processes import Processes
+from robust_instant_policy.evaluation.processes import LocalWorkers
 from robust_instant_policy.evaluation.work import SceneWork
 from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.llm import model_name
@@ -136,8 +136,8 @@ def _scaling(suite: Suite, setup: Setup, folder: Path) -> list[str]:
                 arrivals.append(time.perf_counter())
 
         start = time.perf_counter()
-        progress = Progress(lambda *_: None, outcome)
-        run_suites([suite], setup, folder / f"turn-{turn}", Processes(workers), progress)
+        progress = Progress(outcome=outcome)
+        run_suites([suite], setup, folder / f"turn-{turn}", LocalWorkers(workers), progress)
         rates[workers].append(60 * (len(arrivals) - 1) / (arrivals[-1] - arrivals[0]))
         lines.append(f"| {workers} | {len(arrivals)} | {arrivals[-1] - start:.0f} | {rates[workers][-1]:.0f} |")
     ratio = mean(rates[2]) / mean(rates[1])

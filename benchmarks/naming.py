@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from stored_proposals import NUM_DEMOS, NUM_QUERIES, arguments, proposals
 
-from robust_instant_policy.evaluation import STORE_FILE, Variant, open_episodes
+from robust_instant_policy.evaluation import STORE_FILE, Variant, read_results
 from robust_instant_policy.llm import model_name
-from robust_instant_policy.policies.rip import robust_plan
+from robust_instant_policy.policies import Settings, aggregate
 from robust_instant_policy.reporting.tables import Table
 
 COLUMNS = ("fail, named", "succeed, named", "fail, named without", "succeed, named without")
@@ -27,7 +27,7 @@ NOTE = "Candidates that fail or succeed when executed alone, in scenes in which 
 def executions(run: Path, task: str, llm: str) -> tuple[set[int], dict[int, list[bool]]]:
     """Seeds of the scenes in which `rip` succeeded, and which of each scene's candidates did by themselves."""
     rip, kat = (Variant(name, NUM_DEMOS, NUM_QUERIES, model=model_name(llm)) for name in ("rip", "kat"))
-    rows = [row for row in open_episodes(run).rows if (row.scene.task, row.scene.objects) == (task, "seen")]
+    rows = [row for row in read_results(run).episodes if (row.scene.task, row.scene.objects) == (task, "seen")]
     good = {row.scene.seed for row in rows if row.variant == rip and row.success}
     alone: dict[int, list[bool]] = {}
     for row in sorted((row for row in rows if row.variant == kat), key=lambda row: row.candidate):
@@ -36,15 +36,16 @@ def executions(run: Path, task: str, llm: str) -> tuple[set[int], dict[int, list
 
 
 def counted(run: Path, task: str, data: Path, llm: str) -> np.ndarray:
-    """``(2, 2, 2)``: with or without `Proposal.variation`; candidates that fail or succeed; named, and all of them."""
+    """``(2, 2, 2)``: with or without `Prompt.variation`; candidates that fail or succeed; named, and all of them."""
     good, alone = executions(run, task, llm)
     counts = np.zeros((2, 2, 2), dtype=int)
-    for seed, _, proposal in proposals(task, data, run / STORE_FILE, llm, len(alone)):
+    for seed, context, scene, proposal in proposals(task, data, run / STORE_FILE, llm, len(alone)):
         if seed not in good:
             continue
         succeeded = np.array(alone[seed], dtype=int)
-        for way, known in enumerate((proposal, replace(proposal, variation=None))):
-            named = robust_plan(known).hallucinated
+        without = replace(context, prompt=replace(context.prompt, variation=None))
+        for way, known in enumerate((context, without)):
+            named = aggregate(known, scene, proposal, Settings()).hallucinated
             for outcome in (0, 1):
                 counts[way, outcome] += [named[succeeded == outcome].sum(), (succeeded == outcome).sum()]
     return counts

@@ -29,7 +29,6 @@ import numpy as np
 import torch
 from dino_reference import ReferenceTransformer, load_reference, random_checkpoint
 from PIL import Image, ImageDraw
-from safetensors.torch import save_file
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray
@@ -38,7 +37,7 @@ from robust_instant_policy.perception.accuracy import Accuracy
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.efficientnet import load_network
 from robust_instant_policy.perception.settings import DescriptorSettings
-from robust_instant_policy.perception.vit import VitDescriptors
+from robust_instant_policy.perception.vit import VisionTransformer, VitDescriptors
 from robust_instant_policy.perception.vit_checkpoint import load_checkpoint
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
@@ -164,13 +163,10 @@ def measure_speed(features: str, settings: DescriptorSettings, shape: tuple[int,
     if features == "dino":
         described = VitDescriptors(load_checkpoint(weights), settings)
         batch = described.prepare(images[0].rgb)
-        tokens = described._network
+        network = VisionTransformer(load_checkpoint(weights).model, settings.stride)
 
-        def bare() -> None:  # every block, whole
-            with torch.inference_mode():
-                state, _ = tokens._embed(batch)
-                for index in range(tokens.config.num_hidden_layers):
-                    state = tokens._block(index, state)
+        def bare() -> None:
+            network.features(batch, settings.layer, settings.facet)
     else:
         network = load_network()
         rows, cols = (round(edge * settings.load_size / min(shape) * 4 / settings.stride / 16) * 16 for edge in shape)
@@ -222,8 +218,8 @@ def speed(features: list[str], columns: list[str], checkout: Path | None) -> Non
     one_thread = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
-        weights = str(Path(folder) / "model.safetensors")
-        save_file(dict(random_checkpoint(0).tensors), weights)
+        weights = folder
+        random_checkpoint(0).model.save_pretrained(weights)
         for column in columns:
             for name in features:
                 command = [sys.executable, __file__, "one", name, column, weights]

@@ -24,12 +24,11 @@ from pathlib import Path
 import numpy as np
 from pick_and_place import TASKS, WITHIN_M, PickAndPlace, Scene, key_error
 
-from robust_instant_policy.context import InContextPrompt
-from robust_instant_policy.context.prompt import Frames, Layout, Order
+from robust_instant_policy.context import Frames, Layout, Order, Prompt, write_prompt
 from robust_instant_policy.errors import ModelError
 from robust_instant_policy.llm import LanguageModel, Listener, Sampling, connect
 from robust_instant_policy.query import Query
-from robust_instant_policy.regression import robust_gripper_trajectory
+from robust_instant_policy.regression import DEFAULT_DOF, robust_gripper_trajectory
 from robust_instant_policy.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[1]
@@ -37,7 +36,6 @@ KEPT, TABLE = ROOT / "results" / "prompting.jsonl", ROOT / "docs" / "tables" / "
 NUM_DEMOS = 10
 NUM_SAMPLES = 5  # Q
 MIN_CANDIDATES = 3
-DOF = 1.5
 FIRST_NEW_SEED = 1000  # demonstrations count from 0
 
 
@@ -98,14 +96,14 @@ class Measurement:
             self._prompt.queries(scene.keypoints),
             Sampling(NUM_SAMPLES, self._row.temperature, seed=number, deadline_s=self._deadline_s),
             Listener(
-                self._prompt.accepts,
+                self._prompt.read,
                 on_answer=lambda query, sample, attempt, answer, accepted: counts.update([accepted]),
             ),
         )
         seconds, cpu_seconds = time.monotonic() - start, time.process_time() - cpu
         every = [answer for own in answers for answer in own]
         candidates = [
-            self._prompt.trajectory([own[index].text for own in answers], scene.keypoints)
+            self._prompt.trajectory([own[index].value for own in answers], scene.keypoints)
             for index in range(min(map(len, answers)))
         ]
         single = [key_error(candidate, scene.trajectory) for candidate in candidates]
@@ -113,8 +111,8 @@ class Measurement:
             scene=number,
             cold=self._cold,
             single=(*single, *[float("inf")] * (NUM_SAMPLES - len(single))),
-            gaussian=agreed_error(candidates, scene, float("inf"), self._prompt.bends_),
-            robust=agreed_error(candidates, scene, DOF, self._prompt.bends_),
+            gaussian=agreed_error(candidates, scene, float("inf"), self._prompt.curvature),
+            robust=agreed_error(candidates, scene, DEFAULT_DOF, self._prompt.curvature),
             refused=counts[False],
             answers=counts.total(),
             tokens=sum(one.prompt_tokens - one.cached_tokens + one.completion_tokens for one in every),
@@ -139,15 +137,15 @@ class Measurement:
         return self._model.count_tokens(read) + NUM_SAMPLES * self._model.count_tokens(answer)
 
 
-def fitted(demos: Sequence[Scene], frames: Frames, layout: Layout, order: Order) -> InContextPrompt:
-    prompt = InContextPrompt(frames, layout, order)
-    return prompt.fit(np.stack([demo.keypoints for demo in demos]), [demo.trajectory for demo in demos])
+def fitted(demos: Sequence[Scene], frames: Frames, layout: Layout, order: Order) -> Prompt:
+    keypoints = np.stack([demo.keypoints for demo in demos])
+    return write_prompt(keypoints, [demo.trajectory for demo in demos], frames, layout, order)
 
 
-def agreed_error(candidates: Sequence[Trajectory], scene: Scene, dof: float, bends: np.ndarray) -> float:
+def agreed_error(candidates: Sequence[Trajectory], scene: Scene, dof: float, curvature: np.ndarray) -> float:
     if len(candidates) < MIN_CANDIDATES:
         return float("inf")
-    fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof, bends=bends)
+    fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof, curvature=curvature)
     return key_error(Trajectory.from_actions(fit.actions), scene.trajectory)
 
 

@@ -17,12 +17,12 @@ from pick_and_place import key_error
 from stored_proposals import NUM_DEMOS, arguments, proposals
 
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.policies.instant import Proposal
-from robust_instant_policy.policies.rip import DOF, robust_plan
+from robust_instant_policy.policies import Context, LocatedScene, Proposal, Settings, aggregate
+from robust_instant_policy.regression import DEFAULT_DOF
 from robust_instant_policy.reporting.tables import Table
 from robust_instant_policy.trajectory import Trajectory
 
-COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, bends unknown", "robust")
+COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, curvature unknown", "robust")
 
 
 def sharpest_turn(trajectory: Trajectory) -> float:
@@ -31,11 +31,12 @@ def sharpest_turn(trajectory: Trajectory) -> float:
     return float(np.linalg.norm(np.diff(points, n=2, axis=0), axis=-1).max())
 
 
-def turns(proposal: Proposal) -> tuple[list[float], float]:
-    """The sharpest turns in the order of `COLUMNS` but the first, and what knowing the bends moves at key steps."""
+def turns(context: Context, scene: LocatedScene, proposal: Proposal) -> tuple[list[float], float]:
+    """The sharpest turns in the order of `COLUMNS` but the first, and what knowing those shown moves at key steps."""
+    unknown = replace(context, prompt=replace(context.prompt, curvature=None))
     gaussian, free, robust = (
-        robust_plan(candidates, dof).trajectory
-        for candidates, dof in ((proposal, np.inf), (replace(proposal, bends=None), DOF), (proposal, DOF))
+        aggregate(known, scene, proposal, Settings(dof=dof)).trajectory
+        for known, dof in ((context, np.inf), (unknown, DEFAULT_DOF), (context, DEFAULT_DOF))
     )
     paths = (proposal.candidates[0], gaussian, free, robust)
     return [sharpest_turn(path) for path in paths], key_error(robust, free)
@@ -44,11 +45,11 @@ def turns(proposal: Proposal) -> tuple[list[float], float]:
 def measured(task_name: str, data: Path, samples: Path, llm: str, scenes: int) -> tuple[str, ...]:
     """A line of the table."""
     rows, moved = [], []
-    for _, policy, proposal in proposals(task_name, data, samples, llm, scenes):
-        row, difference = turns(proposal)
+    for _, context, scene, proposal in proposals(task_name, data, samples, llm, scenes):
+        row, difference = turns(context, scene, proposal)
         rows.append(row)
         moved.append(difference)
-        shown = [sharpest_turn(trajectory) for trajectory in policy.context.trajectories_]
+        shown = [sharpest_turn(trajectory) for trajectory in context.trajectories]
     columns: list[FloatArray] = [np.array(shown), *np.array(rows).T]
     cells = [f"{1000 * np.median(column):.0f} ({1000 * column.max():.0f})" for column in columns]
     return task_name, *cells, f"{1000 * np.median(moved):.1f} ({1000 * max(moved):.1f})"

@@ -12,8 +12,16 @@ import robust_instant_policy as rip
 from robust_instant_policy.evaluation.scenes import FIRST_TEST_SEED
 from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
 from robust_instant_policy.llm import ReplayedModel, SampleStore, model_name
-from robust_instant_policy.policies import InstantPolicy
-from robust_instant_policy.policies.instant import Proposal
+from robust_instant_policy.policies import (
+    Context,
+    LocatedScene,
+    Proposal,
+    Settings,
+    build_context,
+    locate,
+    propose,
+    sample,
+)
 from robust_instant_policy.tasks import make_task
 
 NUM_DEMOS, NUM_QUERIES = 10, 5
@@ -21,14 +29,17 @@ NUM_DEMOS, NUM_QUERIES = 10, 5
 
 def proposals(
     task_name: str, data: Path, samples: Path, llm: str, scenes: int
-) -> Iterator[tuple[int, InstantPolicy, Proposal]]:
-    """Each scene's seed, the policy, and what it proposes there."""
+) -> Iterator[tuple[int, Context, LocatedScene, Proposal]]:
+    """Each scene's seed, the demonstrations' context, what was located in the scene, and what was proposed there."""
     task = make_task(task_name)
     demonstrations = rip.load_demonstrations(data / task_name, task=task_name, limit=NUM_DEMOS)
     model = ReplayedModel(SampleStore(samples), model_name(llm))
-    policy = InstantPolicy(model, workspace=task.workspace).fit(demonstrations)
+    settings = Settings(num_queries=NUM_QUERIES).changed(workspace=task.workspace)
+    context = build_context(demonstrations, settings)
     for seed in tqdm(range(FIRST_TEST_SEED, FIRST_TEST_SEED + scenes), desc=task_name):
-        yield seed, policy, policy.propose(task.reset(seed), NUM_QUERIES)
+        scene = locate(context, task.reset(seed))
+        drawn = sample(context, scene, model, settings, NUM_QUERIES)
+        yield seed, context, scene, propose(context, scene, drawn, NUM_QUERIES)
     task.close()
 
 

@@ -11,7 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 from robust_instant_policy import Observation, Plan
 from robust_instant_policy.datasets.video import decode_video
 from robust_instant_policy.geometry import project
-from robust_instant_policy.reporting.run import CANDIDATE_COLOURS, HALLUCINATED_COLOUR, KEYPOINT_COLOURS
+from robust_instant_policy.reporting.charts import candidate_colour
+from robust_instant_policy.reporting.pictures import keypoint_colour, tool_points
 
 HEIGHT = 360  # pixels
 EVERY = 2  # of the video's frames
@@ -27,21 +28,17 @@ def seen_and_proposed(folder: Path) -> Image.Image:
     draw = ImageDraw.Draw(image)
 
     def path(trajectory, colour, width):
-        tips = trajectory.triplets[:, 0, 1:].mean(axis=1)
-        pixels = (project(tips, observation.intrinsics, observation.camera_pose) + 0.5) * zoom
+        pixels = (project(tool_points(trajectory, 0), observation.intrinsics, observation.camera_pose) + 0.5) * zoom
         draw.line([tuple(pixel) for pixel in pixels], fill=colour, width=width, joint="curve")
 
     for index, candidate in enumerate(plan.candidates):
-        bad = plan.hallucinated[index]
-        path(candidate, HALLUCINATED_COLOUR if bad else CANDIDATE_COLOURS[index], 1)
+        path(candidate, candidate_colour(plan, index), 1)
     path(plan.trajectory, "white", 4)
     font = ImageFont.load_default(size=11)
     for index, pixel in enumerate((plan.pixels + 0.5) * zoom):
         u, v = pixel
-        draw.ellipse(
-            (u - 7, v - 7, u + 7, v + 7), fill=KEYPOINT_COLOURS[index % len(KEYPOINT_COLOURS)], outline="black"
-        )
-        draw.text((u, v), str(index + 1), fill="black", font=font, anchor="mm")
+        draw.ellipse((u - 7, v - 7, u + 7, v + 7), fill=keypoint_colour(index), outline="black")
+        draw.text((u, v), str(index), fill="black", font=font, anchor="mm")
     return image
 
 

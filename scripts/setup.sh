@@ -6,14 +6,22 @@ cd "$(dirname "$0")/.."
 
 readonly TORCH=$(grep '^torch==' constraints.txt)
 readonly TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
-readonly EXTRAS=sim,aloha,vision,embedded,train,import,distributed,dev
 readonly STAMP=.venv/setup-stamp
+readonly LOG=$(mktemp)
+trap 'rm -f "$LOG"' EXIT
 
 say() { printf '\033[1m[setup]\033[0m %s\n' "$*"; }
 die() { printf '[setup] %s\n' "$*" >&2; exit 1; }
 
+# Runs a command silently; prints all of its output if it fails.
+logged() { "$@" >"$LOG" 2>&1 </dev/null || { cat "$LOG" >&2; return 1; }; }
+
 as_root() {
   if [ "$(id -u)" = 0 ]; then "$@"; elif command -v sudo >/dev/null; then sudo "$@"; else return 1; fi
+}
+
+apt_get() {
+  logged as_root env DEBIAN_FRONTEND=noninteractive apt-get -y --no-install-recommends -o DPkg::Lock::Timeout=120 "$@"
 }
 
 apt_ready=
@@ -21,11 +29,12 @@ apt_install() {
   command -v apt-get >/dev/null || return 1
   if [ -z "$apt_ready" ]; then
     say "reading the package lists"
-    as_root apt-get update -qq || return 1
+    logged as_root dpkg --configure -a || return 1 # completes an interrupted installation
+    apt_get update || return 1
     apt_ready=1
   fi
   say "installing system packages: $*"
-  as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null
+  apt_get install "$@"
 }
 
 find_python() {
@@ -65,9 +74,7 @@ install_vulkan() {
   local id= codename=
   [ -r /etc/os-release ] && id=$(. /etc/os-release && echo "$ID") && codename=$(. /etc/os-release && echo "${VERSION_CODENAME:-}")
   if [ "$id/$codename" = debian/bookworm ]; then
-    add_debian_backports && apt_install libvulkan1 &&
-      as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
-        -t bookworm-backports mesa-vulkan-drivers >/dev/null
+    add_debian_backports && apt_install libvulkan1 && apt_get install -t bookworm-backports mesa-vulkan-drivers
   else
     apt_install libvulkan1 mesa-vulkan-drivers
   fi
@@ -79,13 +86,13 @@ fi
 
 case "$(uname -s)/$(uname -m)" in
   Linux/x86_64) ;;
-  *) die "this set-up covers Linux on x86-64; elsewhere: pip install -e '.[$EXTRAS]' and a Vulkan driver" ;;
+  *) die "this set-up covers Linux on x86-64; elsewhere: pip install -e '.[sim,aloha,vision,embedded]' and a Vulkan driver" ;;
 esac
 
 python=$(find_python) || {
   apt_install python3 python3-venv || true
-  python=$(find_python) || { apt_install python3.11 python3.11-venv || true; python=$(find_python); } ||
-    die "needs Python 3.11 to 3.13 with venv; install it (Debian, Ubuntu: apt install python3.11 python3.11-venv) and run again"
+  python=$(find_python) ||
+    die "needs Python 3.11, 3.12 or 3.13 with venv; install it (Debian 12 or 13, Ubuntu 24.04: apt install python3 python3-venv) and run again"
 }
 say "using $($python --version)"
 
@@ -100,20 +107,31 @@ if [ ${#missing[@]} -gt 0 ]; then
   apt_install "${missing[@]}" || die "needs the system packages ${missing[*]}; install them and run again"
 fi
 
-[ -x .venv/bin/python ] || "$python" -m venv .venv
-pip=(.venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt)
+.venv/bin/python -m pip --version >/dev/null 2>&1 || logged "$python" -m venv --clear .venv || die "could not create .venv"
+# pip writes INSTALLER after a package's files: where it is missing, pip was killed and must install the package again.
+for package in .venv/lib/python3*/site-packages/*.dist-info; do
+  [ -e "$package/INSTALLER" ] || rm -rf "$package"
+done
+pip_install() {
+  logged .venv/bin/python -m pip install --disable-pip-version-check --no-input "$@"
+}
 
 if ! .venv/bin/python -c 'import torch' 2>/dev/null; then
-  say "installing PyTorch (CPU)"
   # The plain index serves a build with several GB of CUDA; prefer the CPU build where it can be had.
-  if .venv/bin/python -c "import urllib.request as u; u.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
-    "${pip[@]}" "$TORCH" --index-url "$TORCH_CPU_INDEX" --extra-index-url https://pypi.org/simple || "${pip[@]}" "$TORCH"
-  else
-    "${pip[@]}" "$TORCH"
+  index=()
+  if "$python" -c "import urllib.request as u; u.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
+    index=(--index-url "$TORCH_CPU_INDEX" --extra-index-url https://pypi.org/simple)
   fi
+  say "installing PyTorch"
+  pip_install -c constraints.txt "${index[@]}" "$TORCH" || die "PyTorch could not be installed; the output of pip is above"
 fi
+# constraints.txt lists every package, so pip need not resolve: ManiSkill and gym-aloha require two packages that do not
+# install on Python 3.13 and that nothing here imports.
 say "installing the package and its dependencies"
-"${pip[@]}" -e ".[$EXTRAS]"
+{ pip_install --no-deps -r constraints.txt && pip_install --no-deps -e .; } ||
+  die "the dependencies could not be installed; the output of pip is above"
+lacking=$(.venv/bin/python -m pip check | grep -vE ' requires (mplib|dm-control), |^No broken' || true)
+[ -z "$lacking" ] || die "constraints.txt is incomplete: $lacking"
 
 if ! mujoco_renders; then
   say "no OpenGL that renders without a screen; installing Mesa's"

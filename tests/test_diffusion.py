@@ -8,7 +8,7 @@ from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError, ModelError, UsageError
-from robust_instant_policy.policies import InstantPolicy, KeypointContext, make_policy
+from robust_instant_policy.policies import Settings, make_policy
 from robust_instant_policy.policies.diffusion import ImageDiffusion, KeypointDiffusion, dp, training, vision
 from robust_instant_policy.policies.diffusion.denoiser import Denoiser
 from robust_instant_policy.policies.diffusion.scaling import Scaling
@@ -27,14 +27,13 @@ def one_thread():
     torch.set_num_threads(threads)
 
 
+ONE = Settings(features="efficientnet", num_queries=1)
+THREE = Settings(features="efficientnet", num_queries=3)
+
+
 @pytest.fixture(scope="module")
 def demonstrations(workbench):
     return load_demonstrations(workbench / "data" / "push-cube")
-
-
-@pytest.fixture(scope="module")
-def context(demonstrations) -> KeypointContext:
-    return KeypointContext(features="efficientnet").fit(demonstrations)
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +110,8 @@ def test_samples_stay_within_limits_and_the_same_seed_gives_the_same(demonstrati
     np.testing.assert_allclose(scaling.restored(scaling.scaled(actions)), actions, atol=1e-12)
 
 
-def test_keypoint_diffusion_learns_recorded_demonstrations(context, demonstrations, workbench, tmp_path):
-    policy = KeypointDiffusion(context, 3, Training(tmp_path, steps=80)).fit(demonstrations)
+def test_keypoint_diffusion_learns_recorded_demonstrations(demonstrations, workbench, tmp_path):
+    policy = KeypointDiffusion(THREE, Training(tmp_path, steps=80)).fit(demonstrations)
     losses = policy.trained_.losses
     assert losses[-10:].mean() < 0.3 * losses[:10].mean()
     plan = policy.plan(Observation.load(workbench / "observation.npz"))
@@ -126,32 +125,32 @@ def test_keypoint_diffusion_learns_recorded_demonstrations(context, demonstratio
     assert (plan.trajectory.actions[:, :9] < highest.max(axis=0) + 0.1).all()
 
 
-def test_a_training_that_was_killed_ends_as_if_it_had_not_been(context, demonstrations, tmp_path, monkeypatch):
+def test_a_training_that_was_killed_ends_as_if_it_had_not_been(demonstrations, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "SAVE_EVERY_S", 0.0)
-    whole = KeypointDiffusion(context, 1, Training(tmp_path / "whole", steps=14)).fit(demonstrations)
+    whole = KeypointDiffusion(ONE, Training(tmp_path / "whole", steps=14)).fit(demonstrations)
     with pytest.raises(Killed):
-        KeypointDiffusion(context, 1, Training(tmp_path / "cut", steps=14, report=killed_at(8))).fit(demonstrations)
+        KeypointDiffusion(ONE, Training(tmp_path / "cut", steps=14, report=killed_at(8))).fit(demonstrations)
     assert [path.name for path in (tmp_path / "cut").iterdir()] == [
         f"{whole.trained_.path.stem}.unfinished.safetensors"
     ]
-    resumed = KeypointDiffusion(context, 1, Training(tmp_path / "cut", steps=14)).fit(demonstrations)
+    resumed = KeypointDiffusion(ONE, Training(tmp_path / "cut", steps=14)).fit(demonstrations)
     assert [path.name for path in (tmp_path / "cut").iterdir()] == [whole.trained_.path.name]
     one, other = load_file(whole.trained_.path), load_file(resumed.trained_.path)
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_what_was_trained_is_not_trained_again_and_other_demonstrations_are(context, demonstrations, tmp_path):
-    first = KeypointDiffusion(context, 1, Training(tmp_path, steps=5)).fit(demonstrations)
-    KeypointDiffusion(context, 1, Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
-    fewer = KeypointDiffusion(KeypointContext(features="efficientnet"), 1, Training(tmp_path, steps=5))
+def test_what_was_trained_is_not_trained_again_and_other_demonstrations_are(demonstrations, tmp_path):
+    first = KeypointDiffusion(ONE, Training(tmp_path, steps=5)).fit(demonstrations)
+    KeypointDiffusion(ONE, Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
+    fewer = KeypointDiffusion(ONE, Training(tmp_path, steps=5))
     assert fewer.fit(demonstrations[:4]).trained_.path != first.trained_.path
-    longer = KeypointDiffusion(context, 1, Training(tmp_path, steps=6)).fit(demonstrations)
+    longer = KeypointDiffusion(ONE, Training(tmp_path, steps=6)).fit(demonstrations)
     assert longer.trained_.path != first.trained_.path
 
 
-def test_a_damaged_checkpoint_is_refused_in_one_line(context, demonstrations, tmp_path):
-    policy = KeypointDiffusion(context, 1, Training(tmp_path, steps=5)).fit(demonstrations)
+def test_a_damaged_checkpoint_is_refused_in_one_line(demonstrations, tmp_path):
+    policy = KeypointDiffusion(ONE, Training(tmp_path, steps=5)).fit(demonstrations)
     policy.trained_.path.write_bytes(b"half a file")
     with pytest.raises(ModelError, match="remove it to train again"):
         policy.fit(demonstrations)
@@ -221,8 +220,7 @@ def test_the_command_trains_what_an_evaluation_then_finds(workbench, demonstrati
     assert main([*command, "--method", "kat-dp", "--out", str(tmp_path)]) == 0
     assert "5 steps in" in capsys.readouterr().out
     assert "demonstration 2" in next(tmp_path.glob("*.svg")).read_text()
-    instant = InstantPolicy(llm=None)  # nobody asks it anything
-    make_policy("kat-dp", instant, training=Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
+    make_policy("kat-dp", None, Settings(), Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
     assert main([*command, "--method", "rip", "--out", str(tmp_path)]) == 2
     assert "known: dp, kat-dp" in capsys.readouterr().err
 
@@ -235,5 +233,5 @@ def test_the_report_of_an_evaluation_shows_what_was_learned(workbench, demonstra
     (picture,) = (tmp_path / "run" / "training").glob("push-cube-kat-dp-*-5steps.svg")
     assert "demonstration 2" in picture.read_text()
     page = (tmp_path / "run" / "index.html").read_text()
-    assert page.count("<h2 id=training>") == page.count("href='#training'") == 1
+    assert page.count('<h2 id="training">') == page.count('href="#training"') == 1
     assert picture.stem in page

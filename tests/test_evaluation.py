@@ -1,13 +1,18 @@
-"""Rows, statistics and tables; what workers do is in test_evaluation_workers.py."""
+"""Results, statistics and tables; what workers do is in test_evaluation_workers.py."""
 
 import json
 import math
+import os
 import re
+import resource
+import shutil
+import sqlite3
+import subprocess
+import sys
 from contextlib import closing
 from dataclasses import replace
 from fractions import Fraction
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
@@ -22,23 +27,23 @@ from robust_instant_policy.evaluation import (
     Choice,
     Episode,
     Failure,
+    ResultsStore,
     Scene,
     Suite,
     Variant,
     make_suites,
     merge,
-    open_episodes,
-    open_failures,
     paper,
-    rows,
+    read_results,
+    scene_seed,
 )
-from robust_instant_policy.evaluation.experiment import missing_work, plan_file, wanted_plans
+from robust_instant_policy.evaluation.experiment import missing_work, plan_file, wanted_trials
 from robust_instant_policy.evaluation.failures import video_file
-from robust_instant_policy.evaluation.manifest import Manifest, invocation
-from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test, wilson_interval
-from robust_instant_policy.evaluation.summary import Summary
+from robust_instant_policy.evaluation.manifest import PACKAGE, code_digest
+from robust_instant_policy.evaluation.statistics import Summary, mark, paired_test, t_test, wilson_interval
 from robust_instant_policy.evaluation.variant import labels
-from robust_instant_policy.evaluation.work import MAX_DEATHS, Agenda, SceneWork
+from robust_instant_policy.evaluation.work import SceneWork
+from robust_instant_policy.evaluation.workers import MAX_DEATHS, Agenda
 from robust_instant_policy.llm import SampleStore
 from robust_instant_policy.query import Answer, Query
 from robust_instant_policy.reporting.publication import publish
@@ -108,94 +113,175 @@ def test_what_a_method_does_not_use_does_not_tell_its_variants_apart():
     assert Variant("rip", dof=3.0) != Variant("rip", dof=1.5)
 
 
+def keep(folder, *rows: Episode | Failure) -> None:
+    with closing(ResultsStore(folder)) as store:
+        store.add(*rows)
+
+
 def test_rows_survive_on_disk_and_go_on(tmp_path):
-    table = open_episodes(tmp_path / "out")
-    rows = [episode(KAT, 1, True, of=2), episode(KAT, 1, False, candidate=1, of=2)]
-    for row in rows:
-        table.add(row)
-    table.close()
-    again = open_episodes(tmp_path / "out")
-    assert again.rows == rows
-    again.add(episode(Variant("rip-gauss"), 1, True))
-    again.close()
-    assert open_episodes(tmp_path / "out").rows[-1].variant.dof == math.inf
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["episodes.parquet"]
+    rows = (episode(KAT, 1, True, of=2), episode(KAT, 1, False, candidate=1, of=2))
+    keep(tmp_path / "out", *rows)
+    assert read_results(tmp_path / "out").episodes == rows
+    keep(tmp_path / "out", episode(Variant("rip-gauss"), 1, True))
+    assert read_results(tmp_path / "out").episodes[-1].variant.dof == math.inf
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["results.sqlite"]
 
 
 def test_a_row_is_kept_once(tmp_path):
-    table = open_episodes(tmp_path)
-    table.add(episode(RIP, 1, True))
-    table.add(episode(RIP, 1, True))
-    assert len(table.rows) == 1
+    keep(tmp_path, episode(RIP, 1, True), episode(RIP, 1, True))
+    keep(tmp_path, episode(RIP, 1, False))
+    assert read_results(tmp_path).episodes == (episode(RIP, 1, True),)
 
 
-def test_a_kill_at_any_moment_loses_no_row(tmp_path):
-    table = open_episodes(tmp_path)
-    for seed in range(3):
-        table.add(episode(RIP, seed, True))  # not closed: as after a kill
-    journal = tmp_path / "episodes.journal"
-    journal.write_text(journal.read_text() + '{"task": "push-cu')  # and a row of which half was written
-    again = open_episodes(tmp_path)
-    assert [row.scene.seed for row in again.rows] == [0, 1, 2]
-    again.add(episode(RIP, 3, True))
-    again.close()
-    assert len(open_episodes(tmp_path).rows) == 4
+def test_rows_of_other_code_demonstrations_features_or_deadline_are_rows_of_their_own(tmp_path):
+    settings = ({}, {"code": "a"}, {"demonstrations": "b"}, {"features": "dino"}, {"deadline_s": 60.0})
+    rows = tuple(episode(replace(RIP, **setting), 1, True) for setting in settings)
+    keep(tmp_path, *rows)
+    assert read_results(tmp_path).episodes == rows
+    assert len({video_file(*row.key) for row in rows}) == len(rows)
 
 
-def test_the_journal_of_an_older_version_is_read_like_its_table(tmp_path):
-    table = open_episodes(tmp_path)
-    table.add(episode(KAT, 0, True))
-    journal = tmp_path / "episodes.journal"
-    entry = json.loads(journal.read_text())
-    del entry["assets"]
-    journal.write_text(json.dumps(entry) + "\n")
-    assert open_episodes(tmp_path).rows == [episode(KAT, 0, True)]
+def test_rows_of_two_versions_of_the_code_have_a_line_each_in_the_table():
+    old, new = replace(RIP, code="aaa"), replace(RIP, code="bbb")
+    suite = Suite("table1", ("push-cube",), (old, new), (1, 2))
+    success = tables(Summary(suite, [episode(old, 1, True), episode(old, 2, True), episode(new, 1, False)]))[0]
+    cells = {row[0]: row[1].split()[0] for row in success.rows}
+    assert cells == {"rip (code aaa)": "**100**", "rip (code bbb)": "0"}
+
+
+def test_of_several_sets_of_demonstrations_the_last_counts():
+    first, second = replace(RIP, demonstrations="one"), replace(RIP, demonstrations="two")
+    suite = Suite("table1", ("push-cube",), (RIP,), (1, 2))
+    rows = [episode(first, 1, True), episode(second, 1, False), episode(first, 2, True)]
+    assert Summary(suite, rows).rows == [rows[0], rows[2]]
+    assert Summary(suite, rows[:2]).rows == [rows[1]]
+
+
+def test_a_kill_in_the_middle_of_writing_loses_no_row_and_leaves_no_half(tmp_path):
+    script = (
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "from robust_instant_policy.evaluation import Episode, ResultsStore, Scene, Variant\n"
+        "store = ResultsStore(Path(sys.argv[1]))\n"
+        "for seed in range(100_000):\n"
+        "    scene = Scene('push-cube', 'seen', seed)\n"
+        "    store.add(*(Episode(scene, Variant('rip'), n, 2, True, 1, 1, 1, 1, None, '') for n in range(2)))\n"
+        "    print(seed, flush=True)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True) as writer:
+        assert writer.stdout is not None
+        for _ in range(20):
+            writer.stdout.readline()
+        writer.kill()
+        said = 20 + len(writer.stdout.readlines())
+    seeds = [row.scene.seed for row in read_results(tmp_path).episodes]
+    assert seeds[::2] == seeds[1::2] == list(range(len(seeds) // 2))
+    assert said <= len(seeds) // 2 <= said + 1
 
 
 def test_reading_the_rows_of_a_run_under_way_changes_nothing_on_disk(tmp_path):
-    writer = open_episodes(tmp_path)
-    writer.add(episode(RIP, 0, True))
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    assert len(open_episodes(tmp_path).rows) == 1
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-    writer.add(episode(RIP, 1, True))
-    assert len(open_episodes(tmp_path).rows) == 2  # even if the writer is killed now
+    with closing(ResultsStore(tmp_path)) as writer:
+        writer.add(episode(RIP, 0, True))
+        before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+        assert len(read_results(tmp_path).episodes) == 1
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+        writer.add(episode(RIP, 1, True))
+        assert len(read_results(tmp_path).episodes) == 2
 
 
-def test_a_full_disk_doubles_no_row_once_there_is_space_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(rows, "FOLD_SECONDS", 0.0)
-    table = open_episodes(tmp_path)
-    table.add(episode(RIP, 0, True))
-    with monkeypatch.context() as full:
-        full.setattr(rows, "write_whole", lambda path, content: (_ for _ in ()).throw(DatasetError("no space left")))
-        with pytest.raises(DatasetError, match="no space"):
-            table.add(episode(RIP, 1, True))
-    table.close()
-    assert [row.scene.seed for row in open_episodes(tmp_path).rows] == [0, 1]
+def test_a_full_disk_doubles_no_row_once_there_is_space_again(tmp_path):
+    with closing(ResultsStore(tmp_path)) as store:
+        store.add(episode(RIP, 0, True))
+        _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (store.path.stat().st_size, most))
+        try:
+            with pytest.raises(DatasetError, match="free space"):
+                store.add(*(episode(RIP, seed, True) for seed in range(1, 500)))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+        assert read_results(tmp_path).episodes == (episode(RIP, 0, True),)
+        store.add(*(episode(RIP, seed, True) for seed in range(1, 500)))
+    assert [row.scene.seed for row in read_results(tmp_path).episodes] == list(range(500))
 
 
-def test_a_damaged_or_older_table_is_refused_in_one_line(tmp_path):
-    (tmp_path / "episodes.parquet").write_bytes(b"PAR1 half a file")
-    with pytest.raises(DatasetError, match="move it away"):
-        open_episodes(tmp_path)
-    pq.write_table(pa.table({"task": ["push-cube"], "method": ["rip"]}), tmp_path / "episodes.parquet")
-    with pytest.raises(DatasetError, match="--replay"):
-        open_episodes(tmp_path)
+def test_a_damaged_file_is_refused_in_one_line(tmp_path):
+    for name, content in (("results.sqlite", b"not a database, but 30 bytes"), ("episodes.parquet", b"PAR1 half")):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / name).write_bytes(content)
+        for use in (read_results, ResultsStore):
+            with pytest.raises(DatasetError, match="move it away"):
+                use(folder)
+
+
+def an_export(folder, *rows: Episode | Failure) -> None:
+    """A folder as an older version left it: parquet files and run.json only."""
+    keep(folder, *rows)
+    with closing(ResultsStore(folder)) as store:
+        store.export()
+    (folder / "results.sqlite").unlink()
+
+
+def test_a_folder_with_parquet_files_only_is_read_and_goes_on(tmp_path):
+    lost = episode(RIP, 1, False)
+    an_export(tmp_path, lost, Failure(*lost.key, "samples", True, False, 0.01, False))
+    parquet = (tmp_path / "episodes.parquet").read_bytes()
+    (tmp_path / "results.sqlite").touch()  # as one that was killed when it had just begun
+    results = read_results(tmp_path)
+    assert (results.episodes, results.failures[0].key) == ((lost,), lost.key)
+    assert (tmp_path / "episodes.parquet").read_bytes() == parquet
+    keep(tmp_path, episode(RIP, 2, True))
+    assert read_results(tmp_path).episodes == (lost, episode(RIP, 2, True))
+    assert read_results(tmp_path).failures == results.failures
 
 
 def test_a_setting_that_came_after_a_file_was_written_has_its_default(tmp_path):
-    table = open_episodes(tmp_path)
-    table.add(episode(RIP, 1, True))
-    table.close()
+    an_export(tmp_path, episode(RIP, 1, True))
     path = tmp_path / "episodes.parquet"
-    pq.write_table(pq.read_table(path).drop_columns(["features"]), path)
-    assert open_episodes(tmp_path).rows == [episode(RIP, 1, True)]
+    pq.write_table(pq.read_table(path).drop_columns(["features", "code", "assets"]), path)
+    assert read_results(tmp_path).episodes == (episode(RIP, 1, True),)
+    pq.write_table(pq.read_table(path).select(["task", "method"]), path)
+    with pytest.raises(DatasetError, match="--replay"):
+        read_results(tmp_path)
+
+
+def test_a_store_of_an_older_version_gets_the_columns_that_came_later(tmp_path):
+    keep(tmp_path, episode(RIP, 1, True))
+    with closing(sqlite3.connect(tmp_path / "results.sqlite")) as database:
+        database.executescript("DROP INDEX episodes_key; ALTER TABLE episodes DROP COLUMN code")
+    assert read_results(tmp_path).episodes == (episode(RIP, 1, True),)
+    keep(tmp_path, episode(RIP, 1, False), episode(replace(RIP, code="new"), 1, False))
+    assert read_results(tmp_path).episodes == (episode(RIP, 1, True), episode(replace(RIP, code="new"), 1, False))
+
+
+def test_code_that_decides_results_makes_other_rows_and_a_command_does_not(tmp_path):
+    def digest_after(changed: str | None) -> str:
+        copy = tmp_path / str(changed).replace("/", "-")
+        shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+        if changed is not None:
+            with (copy / changed).open("a") as file:
+                file.write("\n")
+        return code_digest(copy)
+
+    same = ("commands/eval.py", "reporting/tables.py", "evaluation/store.py")
+    deciding = ("policies/rip.py", "evaluation/rollout.py", "tasks/maniskill/ur5e_hande.urdf")
+    assert {digest_after(None), *map(digest_after, same)} == {code_digest()}
+    assert len({code_digest(), *map(digest_after, deciding)}) == 1 + len(deciding)
+
+
+def test_any_seed_draws_a_scene_of_its_own_that_tables_can_hold(tmp_path):
+    assert scene_seed(3, 4) == 103_004
+    seeds = [scene_seed(seed, index) for seed in (0, 4_294_867, 10**18, 10**40) for index in range(3)]
+    assert len(set(seeds)) == len(seeds)
+    keep(tmp_path, *(episode(RIP, seed, True) for seed in seeds))
+    an_export(tmp_path)
+    assert [row.scene.seed for row in read_results(tmp_path).episodes] == seeds
 
 
 def test_work_goes_on_with_the_executions_that_are_missing(tmp_path):
     suite = Suite("chosen", ("push-cube",), (RIP, KAT), (1, 2, 3))
     rows = [episode(RIP, 1, True), episode(KAT, 1, True, of=2), episode(RIP, 2, True), episode(KAT, 2, True)]
-    works = missing_work(wanted_plans([suite]), [], rows, [], tmp_path, films=False)
+    works = missing_work(wanted_trials([suite]), [], rows, [], tmp_path, films=False)
     assert [(work.scene.seed, work.variants) for work in works] == [(1, (KAT,)), (3, (RIP, KAT))]
     assert (Scene("push-cube", "seen", 1), KAT, 0) in works[0].done
 
@@ -203,15 +289,15 @@ def test_work_goes_on_with_the_executions_that_are_missing(tmp_path):
 def test_a_failed_episode_that_nobody_examined_is_work_left(tmp_path):
     suite = Suite("chosen", ("push-cube",), (RIP,), (1,))
     lost = episode(RIP, 1, False)
-    (work,) = missing_work(wanted_plans([suite]), [], [lost], [], tmp_path, films=False)
+    (work,) = missing_work(wanted_trials([suite]), [], [lost], [], tmp_path, films=False)
     assert work.failed == (lost,)
     assert not work.variants
 
 
 def test_suites_that_ask_for_the_same_plans_ask_once():
     table1, demos = make_suites(["table1", "demos"], Choice(RIP, tasks=["push-cube"], methods=["rip"]))
-    both = wanted_plans([table1, demos])
-    assert len(both) == len(wanted_plans([demos])) == 50
+    both = wanted_trials([table1, demos])
+    assert len(both) == len(wanted_trials([demos])) == 50
     assert len(make_suites(["all"], Choice(RIP))) == 6
 
 
@@ -250,7 +336,7 @@ def test_every_analysis_has_a_table_even_when_half_is_missing(name):
     row = Episode(**{**vars(row), "scene": scene})
     (table,) = tables(Summary(suite, [row]))
     assert "100" in table.markdown()
-    assert table.html().count("<tr>") == len(table.rows) + 1
+    assert table.markdown().count("\n| ") == len(table.rows) + 1  # the rule below the head, and the rows
 
 
 def test_methods_stand_in_one_order_whichever_was_run_first():
@@ -293,27 +379,24 @@ def test_a_run_remembers_its_suites_and_the_commands_that_made_it(tmp_path):
     one = Suite("table1", ("push-cube",), (RIP,), (1,))
     two = Suite("table1", ("turn-faucet",), (Variant("rip-gauss"),), (1, 2))
     for suite in (one, two):
-        with invocation(tmp_path, [suite], ["rip", "eval", "--out", "a b"], "a model"):
-            pass
-    manifest = Manifest.read(tmp_path)
+        a_run(tmp_path, suite, [], [])
+    manifest = read_results(tmp_path).manifest
     assert manifest.suites == (one.merged(two),)
     assert manifest.suites[0].tasks == ("push-cube", "turn-faucet")
-    assert [one.command for one in manifest.invocations] == ["rip eval --out 'a b'"] * 2
+    assert [one.command for one in manifest.invocations] == [f"rip eval --out {tmp_path.name}"] * 2
+    assert json.loads((tmp_path / "run.json").read_text())["invocations"][0]["model"] == "a model"
 
 
 def a_run(folder, suite: Suite, rows: list[Episode], answers: list[str]) -> None:
-    with invocation(folder, [suite], ["rip", "eval", "--out", folder.name], "a model"):
-        table, failures = open_episodes(folder), open_failures(folder)
-        for row in rows:
-            table.add(row)
-            if not row.success:
-                failures.add(Failure(*row.key, "samples", True, False, 0.01, False))
-        table.close()
-        failures.close()
-    store = SampleStore(folder / STORE_FILE)
-    for sample, text in enumerate(answers):
-        store.write("a model", Query("1 2 ", max_tokens=4), "{}", sample, 0, Answer(text))
-    store.close()
+    with (
+        closing(ResultsStore(folder)) as store,
+        store.invocation([suite], ["rip", "eval", "--out", folder.name], "a model"),
+    ):
+        store.add(*rows)
+        store.add(*(Failure(*row.key, "samples", True, False, 0.01, False) for row in rows if not row.success))
+    with closing(SampleStore(folder / STORE_FILE)) as samples:
+        for sample, text in enumerate(answers):
+            samples.write("a model", Query("1 2 ", max_tokens=4), "{}", sample, 0, Answer(text))
 
 
 def test_runs_are_merged_and_what_two_of_them_did_counts_once(tmp_path):
@@ -327,13 +410,15 @@ def test_runs_are_merged_and_what_two_of_them_did_counts_once(tmp_path):
     (one / film).write_bytes(b"a film")
 
     assert [(share.new, share.known) for share in merge([one, two], out)] == [(2, 0), (1, 1)]
-    rows = open_episodes(out).rows
-    assert rows == [episode(RIP, 1, True), episode(RIP, 2, False), episode(Variant("gp"), 1, True)]
-    assert [failure.key for failure in open_failures(out).rows] == [rows[1].key]
+    results = read_results(out)
+    rows = results.episodes
+    assert rows == (episode(RIP, 1, True), episode(RIP, 2, False), episode(Variant("gp"), 1, True))
+    assert [failure.key for failure in results.failures] == [rows[1].key]
+    assert pq.read_table(out / "episodes.parquet").num_rows == 3
     assert (out / film).read_bytes() == b"a film"
     with closing(SampleStore(out / STORE_FILE)) as store:
         assert store.models()[0].answers == 3
-    manifest = Manifest.read(out)
+    manifest = results.manifest
     assert manifest.suites == (ours.merged(theirs),)
     assert [command.command for command in manifest.invocations] == ["rip eval --out one", "rip eval --out two"]
 
@@ -348,8 +433,8 @@ def test_the_failure_that_was_examined_is_that_of_the_row_that_counts(tmp_path):
     a_run(won, suite, [episode(RIP, 1, True)], [])
     a_run(lost, suite, [episode(RIP, 1, False)], [])
     merge([won, lost], out)
-    assert open_episodes(out).rows[0].success
-    assert open_failures(out).rows == []
+    assert read_results(out).episodes[0].success
+    assert read_results(out).failures == ()
 
 
 def test_a_run_that_cannot_be_merged_is_told_before_anything_is_written(tmp_path, capsys):
@@ -373,6 +458,24 @@ def test_what_table1_shows_has_no_section_of_its_own_in_the_report(tmp_path):
     publish(tmp_path)
     assert (tmp_path / "table1.md").exists()
     assert not (tmp_path / "chosen.md").exists()
+
+
+def test_a_terminal_that_knows_ascii_only_shows_other_signs(tmp_path):
+    folder = tmp_path / "Läufe"
+    a_run(folder, Suite("table1", ("push-cube",), (RIP,), (1,)), [episode(RIP, 1, True)], [])
+    code = "import sys; from robust_instant_policy.cli import main; sys.exit(main())"
+    ascii_only = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-c", code, "report", str(folder)]
+    done = subprocess.run(command, env=ascii_only, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.search(r"L\?+ufe", done.stdout)
+
+
+def test_a_table_of_commands_that_is_not_utf_8_is_told_in_one_line(tmp_path, capsys):
+    an_export(tmp_path, episode(RIP, 1, True))
+    (tmp_path / "run.json").write_bytes('{"suites": "ä"}'.encode("latin-1"))
+    assert main(["report", str(tmp_path)]) == 1
+    assert "run.json is damaged" in capsys.readouterr().err
 
 
 def test_objects_of_code_and_downloaded_ones_have_a_table_each(tmp_path):

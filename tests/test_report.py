@@ -8,16 +8,28 @@ import pytest
 from robust_instant_policy import Observation, Plan, Trajectory
 from robust_instant_policy.cli import main
 from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.evaluation import Episode, Scene, Variant
 from robust_instant_policy.geometry import GripperTriangle, make_pose
 from robust_instant_policy.policies import Stage, Usage
-from robust_instant_policy.reporting.run import PLAN_FILE, SEEN_FILE, RunRecord, save_context, write_report
+from robust_instant_policy.reporting.evaluation import Section, evaluation_page
+from robust_instant_policy.reporting.run import (
+    CONTEXT_FILE,
+    PLAN_FILE,
+    SEEN_FILE,
+    RunRecord,
+    save_context,
+    write_report,
+)
+from robust_instant_policy.reporting.tables import Table
+from tests.pages import Page
 
 QUERIES, STEPS, KEYPOINTS = 5, 12, 10
 
 
-def straight_trajectory(offset_m: float) -> Trajectory:
-    poses = np.stack([make_pose(np.diag([1.0, -1, -1]), [0.02 * t, offset_m, 0.1]) for t in range(STEPS)])
-    return Trajectory.from_poses(poses, np.arange(STEPS) > 6, GripperTriangle(0.12, 0.05))
+def straight_trajectory(offset_m: float, steps: int = STEPS, arms: int = 1) -> Trajectory:
+    poses = np.stack([make_pose(np.diag([1.0, -1, -1]), [0.02 * t, offset_m, 0.1]) for t in range(steps)])
+    one_arm = Trajectory.from_poses(poses, np.arange(steps) > 6, GripperTriangle(0.12, 0.05))
+    return Trajectory(np.tile(one_arm.actions, (1, arms)), one_arm.times)
 
 
 @pytest.fixture
@@ -97,19 +109,98 @@ def test_a_plan_whose_confidence_is_no_confidence_is_refused(tmp_path, plan, val
 
 
 def test_the_report_tells_the_whole_story_without_the_network(run_folder):
-    page = write_report(run_folder).read_text()
-    assert page.count("<figure") == 5  # the proposals, the new scene, three demonstrations
-    assert "failed: it &lt;slipped&gt;" in page
-    assert "a &lt;remark&gt;" in page
-    assert "candidate 4 (hallucinated)" in page
-    assert "step 4 of 12" in page
-    assert "12.3" in page
-    assert "9,000" in page
-    assert "world x [mm]" in page
-    assert "gripper z (approach)" in page
-    head = page[: page.index("<script>")] + page[page.index("</script>") :]
-    assert 'src="http' not in head
-    assert 'href="http' not in head
+    page = Page(write_report(run_folder).read_text())
+    assert len(page.of("figure")) == 5  # no video; the candidates, the new scene, three demonstrations
+    for words in (
+        "failed: it <slipped>", "a <remark>", "candidate 4 (hallucinated)", "step 4 of 12", "12.3", "9,000", "0.90",
+        "column 9", "not executed",
+    ):  # fmt: skip
+        assert words in page.text
+    content = (run_folder / "report.html").read_text()
+    assert "world x [mm]" in content
+    assert "gripper z (approach)" in content
+    assert content.count("plotly.js v") == 1
+    assert page.loaded() == []
+
+
+NO_CANDIDATES = {
+    "candidates": (), "weights": np.zeros((0, STEPS)), "hallucinated": np.zeros(0, bool), "onset": np.zeros(0, int),
+    "scores": np.zeros(0),
+}  # fmt: skip
+
+
+def odd_plans(plan: Plan) -> dict[str, Plan]:
+    two_arms = straight_trajectory(0.0, arms=2)
+    return {
+        "no candidates": replace(plan, **NO_CANDIDATES),
+        "longer candidates": replace(
+            plan,
+            candidates=tuple(straight_trajectory(0.01 * index, 40) for index in range(QUERIES)),
+            onset=np.array([-1, -1, -1, 30, -1]),
+        ),
+        "shorter candidates": replace(
+            plan, candidates=tuple(straight_trajectory(0.01 * index, 1 + index) for index in range(QUERIES))
+        ),
+        "one step": replace(
+            plan, trajectory=straight_trajectory(0.0, 1), weights=np.ones((QUERIES, 1)), scale=np.zeros((1, 10))
+        ),
+        "two arms": replace(
+            plan, trajectory=two_arms, candidates=(two_arms,) * QUERIES, scale=np.full((STEPS, 20), 0.01)
+        ),
+        "nothing seen": replace(
+            plan, keypoints=np.zeros((0, 3)), pixels=np.zeros((0, 2)), keypoint_confidence=np.zeros(0)
+        ),
+        "nothing judged": replace(plan, confidence=None, notes=(), usage=Usage()),
+        "a single sample": replace(plan, **NO_CANDIDATES, confidence=None, scale=np.zeros((STEPS, 10))),
+    }
+
+
+TOLD = {
+    "no candidates": "The plan has no candidates",
+    "longer candidates": "step 30 of 40 (time 0.77)",
+    "shorter candidates": "candidate 5",
+    "one step": "step 4 of 12",
+    "two arms": "arm 2 gripper state",
+    "nothing seen": "4 of 5",
+    "nothing judged": "No check left a note",
+    "a single sample": "does not compare the candidates",
+}
+
+
+@pytest.mark.parametrize("case", TOLD)
+def test_a_plan_of_any_shape_has_a_report(run_folder, plan, case):
+    odd_plans(plan)[case].save(run_folder / PLAN_FILE)
+    content = write_report(run_folder).read_text()
+    assert TOLD[case] in content
+    assert ">nan<" not in content
+
+
+def test_a_camera_that_looks_away_has_a_report(run_folder, observation):
+    replace(observation, camera_pose=make_pose(np.eye(3), [0, 0, 5])).save(run_folder / SEEN_FILE)
+    lines = Page(write_report(run_folder).read_text()).of("polyline")
+    assert {line["points"] for line in lines} == {""}
+
+
+def test_words_from_outside_stay_words(run_folder, plan):
+    words = "<img src=x onerror=alert(1)> </script> **キューブ** & “Würfel” {{ 7 * 7 }}"
+    stages = (Stage(words, 1.0),)
+    replace(plan, notes=(words,)).save(run_folder / PLAN_FILE)
+    RunRecord(words, words, 7, words, words, True, words, stages).save(run_folder)
+    page = Page(write_report(run_folder).read_text())
+    assert not page.of("img")
+    assert page.text.count("<img src=x onerror=alert(1)> </script>") >= 6
+    assert "“Würfel” {{ 7 * 7 }}" in page.text
+
+
+def test_words_of_an_evaluation_stay_words(tmp_path):
+    variant = Variant("rip", model="<i>model</i>")
+    row = Episode(Scene("push-cube", "seen", 1), variant, 0, 1, False, 1.0, 1.0, 1.0, 5, 0.5, "<b>slipped</b>")
+    table = Table(("<u>head</u>", "`<s>`"), (("**<em>** </td>", "\\*"),), "<p>")
+    page = Page(evaluation_page(tmp_path, [Section("table1", (), b"<svg/>", [table])], {}, [row], [], table, table))
+    for words in ("<b>slipped</b>", "<u>head</u>", "<em> </td>", "<s>", "not examined"):
+        assert words in page.text
+    assert not {"i", "u", "em", "s"} & {tag for tag, _ in page.seen}
+    assert page.loaded() == []
 
 
 def test_the_report_command_writes_the_page_again(run_folder, capsys):
@@ -128,6 +219,18 @@ def test_a_damaged_run_is_refused_in_one_line(run_folder, capsys):
     (run_folder / "run.json").write_text(json.dumps({"task": 1}))
     assert main(["report", str(run_folder)]) == 1
     assert "damaged" in capsys.readouterr().err
+
+
+def test_damaged_keypoints_of_demonstrations_are_refused_in_one_line(run_folder, capsys):
+    np.savez(run_folder / CONTEXT_FILE, pixels=np.zeros((2, KEYPOINTS, 2)))
+    assert main(["report", str(run_folder)]) == 1
+    (run_folder / CONTEXT_FILE).write_text("hello")
+    assert main(["report", str(run_folder)]) == 1
+    (run_folder / CONTEXT_FILE).unlink()
+    assert main(["report", str(run_folder)]) == 1
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 3
+    assert all(CONTEXT_FILE in error for error in errors)
 
 
 def test_an_observation_comes_back_from_its_file(tmp_path, observation):

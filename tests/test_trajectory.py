@@ -105,10 +105,12 @@ def test_the_gripper_state_is_held_between_steps():
 
 
 def test_two_arms_are_two_triplets():
-    trajectory = Trajectory.from_actions(np.arange(60.0).reshape(3, 20))
+    actions = np.arange(60.0).reshape(3, 20)
+    actions[:, STATE_INDEX::10] = [[0, 1], [1, 0.5], [1, 0]]
+    trajectory = Trajectory.from_actions(actions)
     assert trajectory.num_arms == 2
     assert trajectory.triplets[0, 1].ravel().tolist() == list(range(10, 19))
-    assert trajectory.gripper_state.tolist() == [[9, 19], [29, 39], [49, 59]]
+    assert trajectory.gripper_state.tolist() == [[0, 1], [1, 0.5], [1, 0]]
 
 
 def test_the_poses_of_two_arms_stand_side_by_side():
@@ -128,6 +130,11 @@ def test_the_poses_of_two_arms_stand_side_by_side():
         (np.zeros((2, 10)), [0.0, 0.0], "increase"),
         (np.zeros((2, 10)), [0.0, 1.5], "increase"),
         (np.zeros((2, 10)), [0.0], r"\(2,\)"),
+        (np.full((2, 10), 255.0), None, "0 .open. to 1 .closed."),
+        (np.full((2, 10), -1.0), None, "0 .open. to 1 .closed."),
+        ([["0"] * 10], None, "numbers"),
+        ([[0.0] * 10, [0.0] * 9], None, "numbers"),
+        (np.zeros((2, 10)) + 1j, None, "numbers"),
     ],
 )
 def test_a_trajectory_that_breaks_its_contract_is_refused(actions, times, words):

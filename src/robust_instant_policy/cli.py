@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import errno
 import importlib
+import io
 import sys
 from collections.abc import Sequence
 
@@ -32,8 +33,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line and return its exit status; errors become one line on standard error."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that lacks a sign shows another
+            stream.reconfigure(errors="replace")
     try:
         options = parse(arguments)
+        options.arguments = arguments
         return options.run(options)
     except KeyboardInterrupt:
         print("rip: stopped; what was finished is kept, run the same command again to go on", file=sys.stderr)

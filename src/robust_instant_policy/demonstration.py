@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -12,15 +13,19 @@ from tokenize import TokenError
 from types import MappingProxyType
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from robust_instant_policy.errors import DatasetError, InvalidValueError
-from robust_instant_policy.files import write_whole
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.files import open_regular, write_whole
+from robust_instant_policy.geometry import FloatArray, as_numbers
 from robust_instant_policy.trajectory import Trajectory
 
 FARTHEST_CAMERA_M = 50.0  # from the origin of the world; farther, it is not in metres
+MAX_PIXELS = 2**25  # of an image; one of 7680 x 4320 has fewer
+MAX_SKEW = 1e-3  # of the focal length; pixels of real cameras are rectangular
+MAX_ARRAY_BYTES = 8 * MAX_PIXELS  # depth in float64
+ARRAYS = ("rgb", "depth", "intrinsics", "camera_pose")  # of an observation file
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +33,8 @@ class Observation:
     """One RGB-D image with its calibrated camera.
 
     ``rgb (H, W, 3)`` uint8; ``depth (H, W)`` float32 metres along the optical axis, NaN or 0 where there is
-    no reading; ``intrinsics (3, 3)``; ``camera_pose (4, 4)`` camera to world, OpenCV axes.
+    no reading (infinite and negative values become NaN); ``intrinsics (3, 3)`` in pixels, ``[[fx, 0, cx], [0, fy, cy],
+    [0, 0, 1]]``; ``camera_pose (4, 4)`` camera to world, OpenCV axes.
     Raises `InvalidValueError` for anything else.
     """
 
@@ -39,24 +45,16 @@ class Observation:
 
     def __post_init__(self) -> None:
         rgb = np.array(self.rgb)  # a copy: a camera's driver may write the next image into the same memory
-        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-            raise InvalidValueError(f"rgb must be (H, W, 3) uint8, got {rgb.shape} {rgb.dtype}")
-        depth = np.array(self.depth, dtype=np.float32)
+        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or rgb.size == 0:
+            raise InvalidValueError(f"rgb must be (H, W, 3) uint8, not empty, got {rgb.shape} {rgb.dtype}")
+        depth = as_numbers("depth", self.depth, np.float32)
         if depth.shape != rgb.shape[:2]:
             raise InvalidValueError(f"depth must be {rgb.shape[:2]} like the image, got {depth.shape}")
-        intrinsics = np.array(self.intrinsics, dtype=np.float64)
-        camera_pose = np.array(self.camera_pose, dtype=np.float64)
-        if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all():
-            raise InvalidValueError(f"intrinsics must be (3, 3) and finite, got {intrinsics.shape}")
-        if camera_pose.shape != (4, 4) or not np.isfinite(camera_pose).all():
-            raise InvalidValueError(f"camera_pose must be (4, 4) and finite, got {camera_pose.shape}")
-        rotation = camera_pose[:3, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-            raise InvalidValueError("camera_pose (4, 4) must hold a proper rotation")
-        if not np.allclose(camera_pose[3], [0, 0, 0, 1], atol=1e-6):
-            raise InvalidValueError("the last row of camera_pose (4, 4) must be 0 0 0 1; is it transposed?")
-        if np.abs(camera_pose[:3, 3]).max() > FARTHEST_CAMERA_M:
-            raise InvalidValueError(f"camera_pose puts the camera at {camera_pose[:3, 3]}; is that in metres?")
+        depth[np.isinf(depth) | (depth < 0)] = np.nan
+        intrinsics = as_numbers("intrinsics", self.intrinsics)
+        _check_intrinsics(intrinsics, *rgb.shape[:2])
+        camera_pose = as_numbers("camera_pose", self.camera_pose)
+        _check_camera_pose(camera_pose)
         for name, value in (
             ("rgb", rgb),
             ("depth", depth),
@@ -68,25 +66,24 @@ class Observation:
 
     @classmethod
     def load(cls, path: str | Path) -> Observation:
-        """Read an ``.npz`` file that holds arrays named like the fields; raises `DatasetError` in one line."""
-        names = ("rgb", "depth", "intrinsics", "camera_pose")
+        """Read an ``.npz`` file that holds arrays named like the fields; raises `DatasetError` in one line.
+
+        What the file declares is checked before memory is reserved for it; nothing is unpickled.
+        """
         try:
-            loaded = np.load(path, allow_pickle=False)
-            if not isinstance(loaded, NpzFile):
-                raise ValueError
-            with loaded as arrays:
-                missing = [name for name in names if name not in arrays]
+            with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+                missing = [name for name in ARRAYS if f"{name}.npy" not in archive.namelist()]
                 if missing:
                     raise DatasetError(
-                        f"{path} lacks {', '.join(missing)}; an observation is an .npz with {', '.join(names)}"
+                        f"{path} lacks {', '.join(missing)}; an observation is an .npz with {', '.join(ARRAYS)}"
                     )
-                return cls(*(arrays[name] for name in names))
+                return cls(*(_read_array(archive, name) for name in ARRAYS))
         except FileNotFoundError:
             raise DatasetError(f"no observation at {path}") from None
         except InvalidValueError as error:
             raise DatasetError(f"{path}: {error}") from None
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, TokenError):
-            raise DatasetError(f"{path} is not an .npz file with {', '.join(names)}") from None
+        except UNREADABLE_NPZ:
+            raise DatasetError(f"{path} is not an .npz file with {', '.join(ARRAYS)}") from None
 
     def save(self, path: str | Path) -> None:
         """Write the observation as an ``.npz`` file that `load` reads."""
@@ -97,6 +94,66 @@ class Observation:
         write_whole(Path(path), buffer.getvalue())
 
 
+def _check_intrinsics(intrinsics: FloatArray, height: int, width: int) -> None:
+    """Raises `InvalidValueError` unless they are those of a pinhole camera with an image of this size in pixels."""
+    if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all():
+        raise InvalidValueError(f"intrinsics must be (3, 3) and finite, got {intrinsics.shape}")
+    (fx, skew, cx), (other_skew, fy, cy), last = intrinsics
+    if not np.allclose(last, [0, 0, 1], atol=1e-6):
+        raise InvalidValueError("the last row of intrinsics (3, 3) must be 0 0 1; is it transposed?")
+    if fx <= 0 or fy <= 0:
+        raise InvalidValueError(f"the focal lengths of intrinsics (3, 3) must be positive, got fx {fx:g}, fy {fy:g}")
+    if max(abs(skew), abs(other_skew)) > MAX_SKEW * min(fx, fy):
+        raise InvalidValueError(f"intrinsics (3, 3) have a skew of {skew or other_skew:g}; rectify the image first")
+    if not (-width <= cx <= 2 * width and -height <= cy <= 2 * height):
+        raise InvalidValueError(
+            f"intrinsics (3, 3) put the principal point at ({cx:g}, {cy:g}) of an image of {width} x {height} pixels; "
+            "are they another camera's, or of another resolution?"
+        )
+
+
+def _check_camera_pose(camera_pose: FloatArray) -> None:
+    """Raises `InvalidValueError` unless it is a rigid pose ``(4, 4)`` near the origin of the world."""
+    if camera_pose.shape != (4, 4) or not np.isfinite(camera_pose).all():
+        raise InvalidValueError(f"camera_pose must be (4, 4) and finite, got {camera_pose.shape}")
+    rotation = camera_pose[:3, :3]
+    if np.abs(rotation).max() > 1.1 or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+        raise InvalidValueError("camera_pose (4, 4) must hold a proper rotation")
+    if np.linalg.det(rotation) < 0:
+        raise InvalidValueError("camera_pose (4, 4) must hold a proper rotation, not a reflection")
+    if not np.allclose(camera_pose[3], [0, 0, 0, 1], atol=1e-6):
+        raise InvalidValueError("the last row of camera_pose (4, 4) must be 0 0 0 1; is it transposed?")
+    if np.abs(camera_pose[:3, 3]).max() > FARTHEST_CAMERA_M:
+        raise InvalidValueError(f"camera_pose puts the camera at {camera_pose[:3, 3]}; is that in metres?")
+
+
+# What zipfile, zlib and NumPy's header reader raise for content that is not theirs.
+UNREADABLE_NPZ = (
+    OSError, ValueError, EOFError, RuntimeError, MemoryError, SyntaxError, LookupError, TypeError, OverflowError,
+    zipfile.BadZipFile, zlib.error, TokenError,
+)  # fmt: skip
+
+
+def _read_array(archive: zipfile.ZipFile, name: str) -> NDArray:
+    """One array of an ``.npz``; raises `InvalidValueError` for one of an odd type or size, before it is read."""
+    entry = archive.getinfo(f"{name}.npy")
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # the two that NumPy writes
+        raise InvalidValueError(f"{name} is compressed in a way that NumPy does not write")
+    with archive.open(entry) as stream:
+        version = npy.read_magic(stream)
+        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
+        shape, fortran_order, dtype = read_header(stream)
+        if dtype.kind not in "biuf":
+            raise InvalidValueError(f"{name} must hold real numbers, got {dtype}")
+        num_bytes = math.prod(shape) * dtype.itemsize
+        if len(shape) > 3 or min(shape, default=1) < 0 or num_bytes > MAX_ARRAY_BYTES:
+            raise InvalidValueError(f"{name} must be an image or a matrix, its header says {str(shape)[:80]} {dtype}")
+        content = stream.read(num_bytes)
+    if len(content) != num_bytes:
+        raise InvalidValueError(f"{name} is cut short")
+    return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran_order else "C")
+
+
 @dataclass(frozen=True, eq=False)
 class Demonstration:
     """One episode: the observation at its start, the gripper's trajectory, and what is known about it.
@@ -104,6 +161,7 @@ class Demonstration:
     ``rate_hz`` is the recording rate, so the episode lasted ``(len(trajectory) - 1) / rate_hz`` seconds.
     ``info`` holds further facts worth keeping (strings and numbers only). ``frames()`` reads the images
     ``(H, W, 3)`` uint8 along the way, one for each step of the trajectory, where they were recorded.
+    Raises `InvalidValueError` for a rate that is not finite and positive.
     """
 
     observation: Observation
@@ -113,6 +171,11 @@ class Demonstration:
     seed: int | None = None
     info: Mapping[str, str | float | int] = field(default_factory=lambda: MappingProxyType({}))
     frames: Callable[[], Iterator[NDArray[np.uint8]]] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        rate = self.rate_hz
+        if isinstance(rate, bool) or not isinstance(rate, int | float | np.number) or not 0 < rate < np.inf:
+            raise InvalidValueError(f"rate_hz must be a positive number of Hz, got {rate!r}")
 
     @property
     def seconds(self) -> float:

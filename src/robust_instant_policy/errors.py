@@ -5,6 +5,7 @@ The command turns them into exit codes: 2 for wrong usage, 1 for everything else
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 
 
@@ -32,8 +33,15 @@ class MissingExtraError(RipError):
     """An optional dependency is not installed."""
 
     def __init__(self, package: str, extra: str):
-        super().__init__(f"{package} is not installed; run: pip install 'robust-instant-policy[{extra}]'")
+        super().__init__(f"{package} is not installed; run: {install_command(extra)}")
         self.package, self.extra = package, extra
+
+
+def install_command(extra: str) -> str:
+    """What installs an extra. On Python 3.13 two simulators must be installed without the packages they require."""
+    command = f"pip install 'robust-instant-policy[{extra}]'"
+    simulator = {"sim": "mani_skill", "aloha": "gym-aloha"}.get(extra)
+    return f"{command} && pip install --no-deps {simulator}" if simulator and sys.version_info >= (3, 13) else command
 
 
 class InvalidValueError(RipError, ValueError):

@@ -1,18 +1,80 @@
-"""Files that are there whole or not at all."""
+"""Files on disk: written whole or not at all, and read only where they are regular files."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import fcntl
+import json
 import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, BinaryIO
 
 from robust_instant_policy.errors import DatasetError
 
+MAX_JSON_BYTES = 64 * 2**20
+MAX_EXCERPT = 240  # characters of a file that an error quotes
+KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
 PART_SUFFIX = ".part"  # of hidden files under way; what still bears it was left by a killed process
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """Open a regular file for reading; every reader of a file from outside goes through here.
+
+    Opening a pipe or a device can block or have side effects, and their content has no end. Raises `DatasetError` for
+    one of these and for a folder, `OSError` as `open` does for a file that is missing or unreadable.
+    """
+    _require_regular(path, os.stat(_checked_name(path)).st_mode)
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    try:
+        _require_regular(path, os.fstat(file.fileno()).st_mode)  # the one opened: the name may have been replaced
+    except DatasetError:
+        file.close()
+        raise
+    return file
+
+
+def read_json(path: str | Path, kind: str = "a JSON object") -> dict[str, Any]:
+    """The JSON object in a regular file. Raises `DatasetError` that names the file and the ``kind`` it should be."""
+    try:
+        with open_regular(path) as file:
+            text = file.read(MAX_JSON_BYTES + 1)
+        if len(text) > MAX_JSON_BYTES:
+            raise DatasetError(f"{path} is larger than {MAX_JSON_BYTES >> 20} MiB, too large for such a file")
+        content = json.loads(text.decode())
+    except FileNotFoundError:
+        raise DatasetError(f"{path} is missing; restore it, or write it again") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise DatasetError(f"{path} is not {kind}: it cannot be read as JSON; restore it, or write it again") from error
+    if not isinstance(content, dict):
+        raise DatasetError(f"{path} is not {kind}: it must hold a JSON object; restore it, or write it again")
+    return content
+
+
+def _checked_name(path: str | Path) -> str | Path:
+    if "\0" in str(path):
+        raise DatasetError(f"{str(path)!r} is no file name: it holds a null character")
+    return path
+
+
+def _require_regular(path: str | Path, mode: int) -> None:
+    if not stat.S_ISREG(mode):
+        raise DatasetError(f"{path} is {KINDS.get(stat.S_IFMT(mode), 'something else')}, not a regular file")
+
+
+def excerpt(said: str | Path | Exception) -> str:
+    """What a file or an error says, on one line of at most `MAX_EXCERPT` characters."""
+    text = " ".join(str(said).split())
+    return text if len(text) <= MAX_EXCERPT else text[:MAX_EXCERPT] + "…"
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -21,6 +21,18 @@ FloatArray = NDArray[np.float64]
 MIN_TRIANGLE_HEIGHT_M = 1e-3  # below this the three gripper points say nothing about orientation
 
 
+def as_numbers(name: str, values: ArrayLike, dtype: type = np.float64) -> NDArray:
+    """A copy of ``values`` as an array of ``dtype``; raises `InvalidValueError` that calls it ``name``."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "biuf":  # NumPy would read strings and drop imaginary parts
+            raise ValueError(f"{array.dtype} is no type of real numbers")
+        with np.errstate(over="ignore"):  # too large for float32 is infinite
+            return array.astype(dtype)
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise InvalidValueError(f"{name} must be an array of numbers, got {type(values).__name__} ({error})") from None
+
+
 def make_pose(rotation: ArrayLike, position: ArrayLike) -> FloatArray:
     """Pose ``(4, 4)`` from a rotation matrix ``(3, 3)`` and a position ``(3,)``."""
     pose = np.eye(4)
@@ -68,6 +80,35 @@ def fit_rigid(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
     return pose
 
 
+def rotations_about_vertical(angles: ArrayLike) -> FloatArray:
+    """Rotations ``(..., 3, 3)`` by ``angles (...)`` radians about the world's z axis."""
+    cos, sin = np.cos(angles), np.sin(angles)
+    zero = np.zeros_like(cos)
+    rows = [cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1]
+    return np.stack(rows, axis=-1).reshape(*np.shape(angles), 3, 3)
+
+
+def fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
+    """Motion about the vertical that maps ``source`` onto ``target`` with the least weighted squared error.
+
+    Batched like `fit_rigid`: ``source`` and ``target`` are ``(..., N, 3)``, ``weights`` ``(..., N)``; the result is
+    ``(..., 4, 4)``.
+    """
+    share = weights / weights.sum(axis=-1, keepdims=True)
+    source_mean = (share[..., None, :] @ source)[..., 0, :]
+    target_mean = (share[..., None, :] @ target)[..., 0, :]
+    a = source[..., :2] - source_mean[..., None, :2]
+    b = target[..., :2] - target_mean[..., None, :2]
+    products = np.swapaxes(a * share[..., None], -1, -2) @ b
+    sine = products[..., 0, 1] - products[..., 1, 0]
+    rotation = rotations_about_vertical(np.arctan2(sine, products[..., 0, 0] + products[..., 1, 1]))
+    motion = np.zeros((*rotation.shape[:-2], 4, 4))
+    motion[..., :3, :3] = rotation
+    motion[..., :3, 3] = target_mean - (rotation @ source_mean[..., None])[..., 0]
+    motion[..., 3, 3] = 1.0
+    return motion
+
+
 def interpolate_poses(times: ArrayLike, poses: ArrayLike, at: ArrayLike) -> FloatArray:
     """Poses ``(M, 4, 4)`` at times ``at (M,)``: positions linear, rotations on the shortest arc.
 
@@ -102,36 +143,37 @@ def lift(pixels: ArrayLike, depth: ArrayLike, intrinsics: ArrayLike, camera_pose
 
 @dataclass(frozen=True)
 class GripperTriangle:
-    """The rigid triangle of palm and open fingertips that stands for a gripper's pose.
+    """The rigid triangle of gripper point and open fingertips that stands for a gripper's pose.
 
-    ``length`` is the distance from the palm point to the midpoint of the fingertips, ``opening`` the
-    distance between the open fingertips, both in metres. In the tool frame the palm lies at
-    ``(0, 0, -length)`` and the fingertips at ``(0, ±opening/2, 0)``, the first at +y.
+    ``length`` is the distance from the gripper point to the midpoint of the fingertips, ``opening`` the
+    distance between the open fingertips, both in metres. In the tool frame the gripper point lies at
+    ``(0, 0, -length)`` and the fingertips at ``(0, ±opening/2, 0)``, the first at +y. Any point of the gripper
+    behind the fingertips on the approach axis will do; the simulated UR5e and ALOHA tasks take the arm's flange.
     """
 
     length: float
     opening: float
 
     def __post_init__(self) -> None:
-        if not (self.length > MIN_TRIANGLE_HEIGHT_M and self.opening > MIN_TRIANGLE_HEIGHT_M):
+        if not (MIN_TRIANGLE_HEIGHT_M < self.length < np.inf and MIN_TRIANGLE_HEIGHT_M < self.opening < np.inf):
             raise InvalidValueError(
                 f"a gripper of length {self.length:.4f} m and opening {self.opening:.4f} m has no orientation; "
-                "palm and fingertips must be three distinct points, in metres"
+                "gripper point and fingertips must be three distinct points, in metres"
             )
 
     @classmethod
     def from_triplets(cls, triplets: ArrayLike) -> GripperTriangle:
-        """Median lengths of measured ``triplets (..., 3, 3)`` (palm, fingertip, fingertip)."""
+        """Median lengths of measured ``triplets (..., 3, 3)`` (gripper point, fingertip, fingertip)."""
         triplets = np.asarray(triplets, dtype=np.float64)
-        palm, left, right = triplets[..., 0, :], triplets[..., 1, :], triplets[..., 2, :]
+        point, left, right = triplets[..., 0, :], triplets[..., 1, :], triplets[..., 2, :]
         return cls(
-            float(np.median(np.linalg.norm((left + right) / 2 - palm, axis=-1))),
+            float(np.median(np.linalg.norm((left + right) / 2 - point, axis=-1))),
             float(np.median(np.linalg.norm(left - right, axis=-1))),
         )
 
     @property
     def points(self) -> FloatArray:
-        """Palm and fingertips ``(3, 3)`` in the tool frame."""
+        """Gripper point and fingertips ``(3, 3)`` in the tool frame."""
         half = self.opening / 2
         return np.array([[0.0, 0.0, -self.length], [0.0, half, 0.0], [0.0, -half, 0.0]])
 

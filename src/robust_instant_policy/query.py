@@ -1,20 +1,21 @@
 """What is asked of a language model and what it answers.
 
-`context` writes queries and reads answers, `llm` asks them; neither imports the other.
+`context` writes queries and reads answers, `llm` sends them; neither imports the other.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 
 @dataclass(frozen=True)
 class Query:
     """One prompt.
 
-    ``text`` is what the model continues; ``grammar`` (GBNF) and ``pattern`` (an equivalent regular expression)
-    describe the only well-formed answers, for servers that can enforce either; ``max_tokens`` bounds the answer
-    and ``stop`` ends it. ``instruction`` is what a chat model is told first.
+    The model continues ``text``. ``grammar`` (GBNF) and ``pattern`` (an equivalent regular expression) describe the
+    well-formed answers, for servers that can enforce one of them. ``max_tokens`` bounds the answer and ``stop`` ends
+    it. ``instruction`` is the system message for a chat model.
     """
 
     text: str
@@ -27,7 +28,11 @@ class Query:
 
 @dataclass(frozen=True)
 class Answer:
-    """One sampled continuation, with its cost: tokens read, read from a cache, and written; seconds of wall time."""
+    """One sampled continuation and its cost: tokens read, read from a cache, and written; wall time in seconds.
+
+    ``value`` is what `Listener.accept` read from the text, None when nothing read it. ``fault`` says what is wrong with
+    the answer itself (cut off, withheld, only thinking), empty when nothing is.
+    """
 
     text: str
     prompt_tokens: int = 0
@@ -35,3 +40,5 @@ class Answer:
     completion_tokens: int = 0
     seconds: float = 0.0
     replayed: bool = False
+    value: Any = field(default=None, compare=False)
+    fault: str = field(default="", compare=False)

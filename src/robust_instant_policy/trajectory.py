@@ -1,4 +1,9 @@
-"""Trajectories of gripper triplets, and the two ways to thin them out (Oh et al. 2025, Sec. V-A.3)."""
+"""Trajectories of gripper triplets, and the two ways to downsample them (Oh et al. 2025, Sec. V-A.3).
+
+The triplet of the paper is "the gripper and both fingertips when the gripper is open". Its first point, the gripper
+point here, lies behind the fingertips on the approach axis. The paper does not say where; in this package it is
+wherever `GripperTriangle.length` puts it, which in the simulated tasks is the arm's flange.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.errors import InvalidValueError
-from robust_instant_policy.geometry import FloatArray, GripperTriangle
+from robust_instant_policy.geometry import FloatArray, GripperTriangle, as_numbers
 
-ACTION_DIM = 10  # palm xyz, two fingertips xyz, gripper state
+ACTION_DIM = 10  # gripper point xyz, two fingertips xyz, gripper state
 STATE_INDEX = 9
+STATE_ROUNDING = 1e-6  # by which a gripper state may lie outside [0, 1]
 TARGET_STEPS = 30  # "a length of approximately 30" (Oh et al. 2025)
 
 
@@ -19,25 +25,32 @@ TARGET_STEPS = 30  # "a length of approximately 30" (Oh et al. 2025)
 class Trajectory:
     """A sequence of gripper triplets with gripper state, over normalised time.
 
-    ``actions (T, 10·A)`` float64, for A arms (nearly always one), each: palm point xyz, two open-fingertip
-    points xyz (metres, world frame), gripper state g (0 open, 1 closed).
+    ``actions (T, 10·A)`` float64, for A arms (nearly always one), each: gripper point xyz, two open-fingertip
+    points xyz (metres, world frame), gripper state g (0 open, 1 closed; a measured one may lie between).
     ``times (T,)`` float64, strictly increasing within [0, 1].
 
-    Raises `InvalidValueError` for other shapes, values that are not finite, or times out of order.
+    Raises `InvalidValueError` for other shapes, values that are not finite, gripper states outside [0, 1], or times
+    out of order.
     """
 
     actions: FloatArray
     times: FloatArray
 
     def __post_init__(self) -> None:
-        actions = np.array(self.actions, dtype=np.float64)
-        times = np.array(self.times, dtype=np.float64)
+        actions = as_numbers("actions", self.actions)
+        times = as_numbers("times", self.times)
         if actions.ndim != 2 or actions.shape[0] == 0 or actions.shape[1] == 0 or actions.shape[1] % ACTION_DIM:
             raise InvalidValueError(f"actions must be (T, {ACTION_DIM}) with T >= 1, got {actions.shape}")
         if times.shape != actions.shape[:1]:
             raise InvalidValueError(f"times must be ({len(actions)},) like the actions, got {times.shape}")
         if not np.isfinite(actions).all():
             raise InvalidValueError(f"actions {actions.shape} hold values that are not finite")
+        state = actions[:, STATE_INDEX::ACTION_DIM]
+        if state.min() < -STATE_ROUNDING or state.max() > 1 + STATE_ROUNDING:
+            raise InvalidValueError(
+                f"actions {actions.shape} hold gripper states from {state.min():g} to {state.max():g}; "
+                "they must be scaled to 0 (open) to 1 (closed)"
+            )
         if not (np.isfinite(times).all() and times.min() >= 0 and times.max() <= 1 and (np.diff(times) > 0).all()):
             raise InvalidValueError(f"times {times.shape} must increase strictly within [0, 1]")
         actions.flags.writeable = False
@@ -48,7 +61,7 @@ class Trajectory:
     @classmethod
     def from_actions(cls, actions: ArrayLike) -> Trajectory:
         """Evenly timed trajectory from ``actions (T, 10·A)``."""
-        actions = np.asarray(actions, dtype=np.float64)
+        actions = as_numbers("actions", actions)
         return cls(actions, np.linspace(0.0, 1.0, len(actions)) if actions.ndim else np.zeros(0))
 
     @classmethod
@@ -71,7 +84,7 @@ class Trajectory:
 
     @property
     def triplets(self) -> FloatArray:
-        """Palm and fingertips ``(T, A, 3, 3)``, metres, world frame."""
+        """Gripper point and fingertips ``(T, A, 3, 3)``, metres, world frame."""
         return self.actions.reshape(len(self), self.num_arms, ACTION_DIM)[:, :, :STATE_INDEX].reshape(
             len(self), self.num_arms, 3, 3
         )

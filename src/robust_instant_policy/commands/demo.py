@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import DATA, RUNS, add_method, method_settings, natural
+from robust_instant_policy.commands.options import DATA, RUNS, add_method, method_settings, seed
 from robust_instant_policy.datasets import VideoWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import UnreachableError, UsageError
-from robust_instant_policy.evaluation import obtain_demonstrations, scene_seed
-from robust_instant_policy.evaluation.episodes import holds_episodes
+from robust_instant_policy.evaluation import holds_results, obtain_demonstrations, scene_seed
 from robust_instant_policy.llm import connect
-from robust_instant_policy.policies import InstantPolicy, RobustInstantPolicy
+from robust_instant_policy.policies import RobustInstantPolicy
 from robust_instant_policy.reporting.run import (
     PLAN_FILE,
     SEEN_FILE,
@@ -33,7 +32,7 @@ from robust_instant_policy.tasks.task import Task
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", default="push-cube", help="task to show (default: %(default)s)")
     parser.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
-    parser.add_argument("--seed", type=natural, default=0, help="which new scene (default: %(default)s)")
+    parser.add_argument("--seed", type=seed, default=0, help="which new scene (default: %(default)s)")
     parser.add_argument("--demos", default="10", metavar="N|DIR", help="how many demonstrations, or a folder of them")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/TASK-SEED)")
     add_method(parser)
@@ -54,7 +53,7 @@ def run_demo(
 
     ``demonstrations`` is a number, recorded into ``data/TASK`` where they are missing, or a folder.
     """
-    if holds_episodes(out):
+    if holds_results(out):
         raise UsageError(f"{out} holds an evaluation; give the demo another folder with --out")
     screen = StageConsole()
     scene = scene_seed(seed, 0)
@@ -81,11 +80,10 @@ def _run(
     with screen.stage(f"language model ({llm_spec})"):
         model = connect(llm_spec)
     try:
-        instant = InstantPolicy(model, workspace=task.workspace, progress=screen.done_so_far, **options)
-        policy = RobustInstantPolicy(instant)
+        policy = RobustInstantPolicy(model, workspace=task.workspace, progress=screen.done_so_far, **options)
         with screen.stage("keypoints of the demonstrations"):
             policy.fit(shown)
-        for note in instant.context.extractor.notes_:
+        for note in policy.context_.notes:
             screen.say(f"    {note}")
         with screen.stage("a new scene"):
             observation = task.reset(scene)
@@ -109,7 +107,7 @@ def _run(
     out.mkdir(parents=True, exist_ok=True)
     plan.save(out / PLAN_FILE)
     observation.save(out / SEEN_FILE)
-    save_context(out, [one.observation.rgb for one in shown], instant.context.extractor.pixels_)
+    save_context(out, [one.observation.rgb for one in shown], policy.context_.pixels)
     with screen.stage("execution"), VideoWriter(out / VIDEO_FILE, fps=task.video_hz) as video:
         try:
             execution = task.execute(plan.trajectory, on_frame=video.add)

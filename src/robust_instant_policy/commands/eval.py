@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole, TrainingScreen
-from robust_instant_policy.commands.options import CHECKPOINTS, DATA, add_assets, add_method, natural, positive
+from robust_instant_policy.commands.options import CHECKPOINTS, DATA, add_assets, add_method, positive, seed
 from robust_instant_policy.evaluation import (
     STORE_FILE,
     Analysis,
@@ -22,11 +21,10 @@ from robust_instant_policy.evaluation import (
     make_suites,
     run_suites,
 )
-from robust_instant_policy.evaluation.cluster import Cluster
-from robust_instant_policy.evaluation.episodes import EPISODES_FILE
-from robust_instant_policy.evaluation.manifest import invocation
-from robust_instant_policy.evaluation.processes import Processes
-from robust_instant_policy.evaluation.work import Hands, Outcome
+from robust_instant_policy.evaluation.cluster import RayWorkers
+from robust_instant_policy.evaluation.processes import LocalWorkers
+from robust_instant_policy.evaluation.store import EPISODES_FILE
+from robust_instant_policy.evaluation.work import Outcome, Workers
 from robust_instant_policy.llm import model_name
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.reporting.publication import PAGE_FILE, publish
@@ -49,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demos", type=positive, default=10, metavar="N")
     parser.add_argument("--episodes", type=positive, default=10, metavar="N", help="scenes (default: %(default)s)")
     parser.add_argument("--queries", type=positive, default=5, metavar="Q")
-    parser.add_argument("--seed", type=natural, default=0)
+    parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--llm", default="embedded")
     parser.add_argument(
         "--objects", choices=("seen", "unseen"), default="seen", help="test with objects like those shown, or others"
@@ -62,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--replay", action="store_true", help="answer from the stored samples only, without a model")
     parser.add_argument("--workers", type=positive, metavar="N", help="default: 1, or a Ray cluster's cores")
     parser.add_argument("--ray", metavar="ADDRESS", help="work on the Ray cluster at this address ('auto': this one)")
+    parser.add_argument("--keep", action="store_true", help="do not run again what another version of the code has run")
     parser.add_argument("--no-videos", action="store_true", help="do not film failed episodes once more")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     add_method(parser)
@@ -91,24 +90,18 @@ def run(options: argparse.Namespace) -> int:
         films=not options.no_videos,
         checkpoints=options.checkpoints,
     )
-    evaluate(
-        make_suites(options.suite or ["chosen"], choice),
-        setup,
-        options.out,
-        options.workers,
-        options.ray,
-        ["rip", *sys.argv[1:]],
+    workers: Workers = (
+        LocalWorkers(options.workers or 1) if options.ray is None else RayWorkers(options.ray, options.workers)
     )
+    suites = make_suites(options.suite or ["chosen"], choice)
+    evaluate(suites, setup, options.out, workers, ["rip", *options.arguments], options.keep)
     return 0
 
 
 def evaluate(
-    suites: Sequence[Suite], setup: Setup, out: Path, workers: int | None, ray: str | None, arguments: Sequence[str]
+    suites: Sequence[Suite], setup: Setup, out: Path, workers: Workers, arguments: Sequence[str], keep: bool
 ) -> None:
-    """Run what is missing of ``suites`` with ``workers`` processes (one), or on the Ray cluster at the address ``ray``.
-
-    ``arguments`` are the words of the command, noted in the run's folder.
-    """
+    """Run what is missing of ``suites`` in ``out``, on the screen; then tables, figures and page. See `run_suites`."""
     screen = StageConsole()
 
     def recording(task: str, there: int, count: int, thrown_away: int) -> None:
@@ -119,19 +112,17 @@ def evaluate(
     def outcome(done: int, total: int, what: Outcome | None) -> None:
         if isinstance(what, Analysis):
             failure = what.failure
-            screen.say(f"  {failure.scene} {failure.variant} #{failure.candidate}: lost by {failure.stage}")
+            screen.say(f"  {failure.scene} {failure.variant} #{failure.candidate}: failure due to {failure.stage}")
         elif isinstance(what, Episode):
             verdict = "success" if what.success else f"failed: {what.failure}"
             screen.say(f"  {what.scene} {what.variant} #{what.candidate}: {verdict}")
         screen.done_so_far("plans executed", done, total)
 
-    progress = Progress(recording, outcome, TrainingScreen(screen), partial(keep_training_picture, out))
-    with invocation(out, suites, arguments, model_name(setup.llm)), screen.stage("evaluation"):
-        run_suites(suites, setup, out, _hands(workers, ray), progress)
+    progress = Progress(
+        recording, outcome, TrainingScreen(screen), trained=partial(keep_training_picture, out), note=screen.say
+    )
+    with screen.stage("evaluation"):
+        run_suites(suites, setup, out, workers, progress, arguments, keep)
     screen.say("")
     screen.say(publish(out))
     screen.say(f"rows: {out / EPISODES_FILE}; all of it: {out / PAGE_FILE}")
-
-
-def _hands(workers: int | None, ray: str | None) -> Hands:
-    return Processes(workers or 1) if ray is None else Cluster(ray, workers)

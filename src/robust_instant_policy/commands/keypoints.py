@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import beside, natural, positive
+from robust_instant_policy.commands.options import beside, positive, seed
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.evaluation import scene_seed
@@ -25,7 +25,7 @@ Camera = Callable[[Observation, int], Observation]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demos", type=Path, required=True, metavar="DIR")
     parser.add_argument("--scenes", type=positive, default=20, metavar="N", help="new scenes (default: %(default)s)")
-    parser.add_argument("--seed", type=natural, default=0)
+    parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
     parser.add_argument("--noise", action="store_true", help="with the noise of a stereo depth camera")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR-keypoints.html)")

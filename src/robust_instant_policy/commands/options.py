@@ -6,9 +6,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from robust_instant_policy.tasks.task import bounded_seed
+
 DATA = Path("data")  # where demonstrations are recorded, a folder a task
 RUNS = Path("runs")
 CHECKPOINTS = Path("checkpoints")
+SEED_BITS = 62  # seeds, and those counted up from them, stand in tables of 64-bit integers
 
 
 def natural(text: str) -> int:
@@ -16,6 +19,11 @@ def natural(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"must be a whole number, not {text!r}")
     return int(text)
+
+
+def seed(text: str) -> int:
+    """Any whole number from 0; what no simulator or table could take becomes another, always the same."""
+    return bounded_seed(natural(text), SEED_BITS)
 
 
 def positive(text: str) -> int:

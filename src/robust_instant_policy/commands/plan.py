@@ -10,7 +10,7 @@ from robust_instant_policy.commands.options import add_method, method_settings, 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.llm import connect
-from robust_instant_policy.policies import InstantPolicy, RobustInstantPolicy
+from robust_instant_policy.policies import RobustInstantPolicy
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,8 +31,9 @@ def run(options: argparse.Namespace) -> int:
     with screen.stage(f"language model ({options.llm})"):
         model = connect(options.llm)
     try:
-        instant = InstantPolicy(model, progress=screen.done_so_far, **method_settings(options))
-        policy = RobustInstantPolicy(instant, num_queries=options.queries)
+        policy = RobustInstantPolicy(
+            model, num_queries=options.queries, progress=screen.done_so_far, **method_settings(options)
+        )
         with screen.stage("keypoints of the demonstrations"):
             policy.fit(demonstrations)
         with screen.stage("plan"):

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import add_assets, natural, positive
+from robust_instant_policy.commands.options import add_assets, positive, seed
 from robust_instant_policy.datasets import DatasetWriter
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.record import record
@@ -15,7 +15,7 @@ from robust_instant_policy.tasks.record import record
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", required=True)
     parser.add_argument("--episodes", type=positive, default=10)
-    parser.add_argument("--seed", type=natural, default=0, help="where a new folder starts drawing scenes")
+    parser.add_argument("--seed", type=seed, default=0, help="where a new folder starts drawing scenes")
     parser.add_argument("--images", action="store_true", help="keep the camera's images along the way")
     parser.add_argument(
         "--every", type=positive, default=1, metavar="N", help="keep every N-th step only: 5 of 55 Hz leaves 11 Hz"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from robust_instant_policy.evaluation.episodes import holds_episodes
+from robust_instant_policy.evaluation import export_results, holds_results
 from robust_instant_policy.reporting.publication import PAGE_FILE, publish
 from robust_instant_policy.reporting.run import write_report
 
@@ -15,7 +15,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    if holds_episodes(options.folder):
+    if holds_results(options.folder):
+        export_results(options.folder)
         publish(options.folder)
         print(options.folder / PAGE_FILE)
         return 0

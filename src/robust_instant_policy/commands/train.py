@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole, TrainingScreen
-from robust_instant_policy.commands.options import natural, positive
+from robust_instant_policy.commands.options import positive, seed
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.policies import TRAINED_METHODS, KeypointContext, make_trained_policy
+from robust_instant_policy.policies import TRAINED_METHODS, Settings, make_trained_policy
 from robust_instant_policy.policies.training import DEFAULT_STEPS, Training
 from robust_instant_policy.reporting.training import training_picture
 from robust_instant_policy.tasks import TASK_NAMES, make_task
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="dp needs images along the way")
     parser.add_argument("--limit", type=positive, metavar="N", help="show it the first N of them only")
     parser.add_argument("--steps", type=positive, metavar="N", help="of gradient descent")
-    parser.add_argument("--seed", type=natural, default=0)
+    parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where there is one")
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="rip eval --checkpoints DIR finds it there"
@@ -47,7 +47,7 @@ def train(task: str, method: str, demos: Path, limit: int | None, training: Trai
     screen = StageConsole()
     demonstrations = load_demonstrations(demos, task=task, limit=limit)
     policy = make_trained_policy(
-        method, KeypointContext(workspace=_workspace(task)), replace(training, report=TrainingScreen(screen))
+        method, Settings().changed(workspace=_workspace(task)), replace(training, report=TrainingScreen(screen))
     )
     with screen.stage(f"{method} on {len(demonstrations)} demonstrations"):
         policy.fit(demonstrations)

@@ -1,6 +1,18 @@
 """Demonstrations as text: frames, numbers and prompt layouts."""
 
+from robust_instant_policy.context.factorised import FactorisedPrompt
 from robust_instant_policy.context.frames import Frame
-from robust_instant_policy.context.prompt import InContextPrompt
+from robust_instant_policy.context.prompt import Frames, Layout, Order, Prompt
+from robust_instant_policy.context.sequence import SequencePrompt
+from robust_instant_policy.context.writing import write_prompt
 
-__all__ = ["Frame", "InContextPrompt"]
+__all__ = [
+    "FactorisedPrompt",
+    "Frame",
+    "Frames",
+    "Layout",
+    "Order",
+    "Prompt",
+    "SequencePrompt",
+    "write_prompt",
+]

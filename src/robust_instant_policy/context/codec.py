@@ -1,4 +1,4 @@
-"""Numbers to text, and text back to numbers without ever guessing one."""
+"""Numbers to text, and text back to numbers; an ambiguous text is refused."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def rows_pattern(least: int, most: int, columns: int, state_columns: Sequence[in
 def read_row(text: str, columns: int) -> FloatArray | None:
     """The ``columns`` numbers of one line, or None when the line is anything but exactly these.
 
-    Separators are either commas or spaces throughout ("1,5" between spaces might be a decimal comma); brackets, a
-    label before a colon and punctuation at the ends do not matter.
+    Separators are either all commas or all spaces ("1,5" between spaces may be a decimal comma). Brackets, a label
+    before a colon and punctuation at the ends are ignored.
     """
     line = text.translate(_MINUS).translate(_BRACKETS).strip(_EDGES)
     for candidate in (line, _LABEL.sub("", line, count=1).strip(_EDGES)):
@@ -75,9 +75,9 @@ def read_row(text: str, columns: int) -> FloatArray | None:
 def read_rows(text: str, columns: int) -> FloatArray | None:
     """The rows ``(N, columns)`` of numbers in an answer, or None when one of them cannot be read for certain.
 
-    Around the rows there may be prose and code fences; the last row may be cut off, and is then left out. A line
-    before or between rows that looks like a row but is none makes the answer worthless: a step would be missing. So do
-    words between rows: an example may stand before them, and who knows which is the answer.
+    Prose and code fences may surround the rows, and a last row that was cut off is left out. An answer is refused where
+    a line before or between rows looks like a malformed row (a step would be missing), and where words stand between
+    rows (those before them may be an example).
     """
     rows: list[FloatArray] = []
     broken = False

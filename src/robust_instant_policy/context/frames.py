@@ -1,11 +1,10 @@
 """Frames to write a step's numbers in, and the choice of the one in which the demonstrations agree best.
 
-"Move to 4 cm above the cup" is the same numbers in every demonstration when it is written in the cup's frame, and
-different ones in the world's. Which frame that is changes over a task (first the cup, then the saucer) and is
-found from the demonstrations alone: candidates are the world, each keypoint, rigid frames fitted to keypoints
-that keep their distances to each other, and frames on the way between two of these, for the motion from the one to
-the other; dynamic programming finds the sequence of frames with the smallest spread across demonstrations, paying a
-price for each change of frame.
+"4 cm above the cup" is the same numbers in every demonstration in the cup's frame, and different ones in the world
+frame. Which frame suits changes over a task (first the cup, then the saucer). Candidates are the world, each keypoint,
+rigid frames fitted to keypoints that keep their distances, and frames interpolated between two of these, for the motion
+from one to the other. The Viterbi algorithm finds the sequence of frames with the smallest spread over the
+demonstrations plus a cost for each transition.
 """
 
 from __future__ import annotations
@@ -17,27 +16,29 @@ from typing import Literal
 
 import numpy as np
 
-from robust_instant_policy.geometry import FloatArray, fit_rigid, invert_pose, make_pose, transform_points
+from robust_instant_policy.geometry import FloatArray, fit_rigid, fit_upright, invert_pose, make_pose, transform_points
 
 RIGID_SPREAD_M = 0.010  # keypoints whose distance varies less than this belong to the same object
-DEMOS_TO_TELL_OBJECTS = 3  # with fewer, all distances look alike
-DEMOS_FOR_MEDIANS = 5  # with fewer, a wrong one cannot be told
-OUTLIER_M = 0.006  # a keypoint this far from where the others put it counts half
-SHAPE_ROUNDS = 2  # of fitting the demonstrations' keypoints to each other
-SPREAD_FLOOR_M = 0.002  # differences of spread below this mean nothing
-SWITCH_COST = 1.0  # a change of frame must make the spread e times smaller for one step, or sqrt(e) for two
-KEY_STEP_WEIGHT = 3.0  # how much more the start, the end and gripper changes count
-FEW_POINTS_COST = 0.5  # divided by the number of keypoints: of frames that agree equally, the one on more of them
-TILT_COST = 0.1  # of frames that agree equally, the one that stays upright
-DISTANCE_COST_PER_M = 4.0  # divided by the number of demonstrations: the fewer, the more it matters what is near
-WORLD_DISTANCE_M = 0.25  # the world frame counts as being this far away
+DEMOS_TO_TELL_OBJECTS = 3  # with fewer, all distances look constant
+DEMOS_FOR_MEDIANS = 5  # with fewer, an outlier cannot be identified
+OUTLIER_M = 0.006  # residual at which a keypoint's influence on a fitted pose is halved
+SHAPE_ROUNDS = 2  # iterations of fitting the demonstrations' keypoints to each other
 
-SHARES = tuple(eighths / 8 for eighths in range(1, 8))  # of the way between two frames at which there is one more
-MOST_OBJECTS = 3  # with ways between them and the world
-BETWEEN_COST = 0.1  # of frames that agree equally, one that is not on the way,
-BETWEEN_COST_OF_FEW = 1.0  # divided by the number of demonstrations: among few, some share of the way agrees by chance
-BOARDING_COST = 0.5  # of going over from a frame to the way that begins or ends there: both are no dearer than a change
-ALONG_COST = 0.05  # of going on along the way
+# Costs of the choice of frames, in units of the logarithm of the spread.
+SPREAD_FLOOR_M = 0.002  # differences of spread below this are noise
+KEY_STEP_WEIGHT = 3.0  # weight of the first and last step and of gripper changes; 1 elsewhere
+FEW_POINTS_COST = 0.5  # divided by the number of keypoints: prefer frames on many
+TILT_COST = 0.1  # prefer upright frames
+DISTANCE_COST_PER_M = 4.0  # divided by the number of demonstrations: prefer frames near the gripper
+WORLD_DISTANCE_M = 0.25  # distance of the world frame from the gripper in that cost
+INTERPOLATED_COST = 0.1  # prefer frames that are not interpolated
+INTERPOLATED_COST_FEW_DEMOS = 1.0  # divided by the number of demonstrations: with few, some fit by chance
+TRANSITION_COST = 1.0  # of a change of frame between two steps
+ENDPOINT_TRANSITION_COST = 0.5  # of a transition between an interpolated frame and its endpoint
+SAME_ENDPOINTS_TRANSITION_COST = 0.05  # of a transition between frames interpolated between the same endpoints
+
+INTERPOLATION_SHARES = tuple(eighths / 8 for eighths in range(1, 8))
+MAX_INTERPOLATED_OBJECTS = 3  # interpolated frames lie between these and the world
 
 MAD_TO_STD = 1.4826
 
@@ -50,8 +51,8 @@ class Frame:
 
     ``world`` is the world itself; ``keypoint`` keeps the world's axes with its origin at the keypoint; ``upright``
     also turns about the vertical with the keypoints ``members``, ``rigid`` in all directions. ``shape (N, 3)`` are
-    the members' places in the frame. ``between`` lies the ``share`` of the way from the first of ``ends`` to the
-    second, and is turned the share ``turn`` of the angle from the one to the other.
+    the members' positions in the frame. ``between`` is interpolated: its origin at ``share`` of the segment from the
+    first of ``ends`` to the second, its rotation at ``turn`` of the angle between them.
     """
 
     kind: Kind
@@ -81,13 +82,15 @@ class Frame:
         names = " ".join(str(member) for member in self.members)
         return f"keypoint {names}" if self.kind == "keypoint" else f"{self.kind} on keypoints {names}"
 
-    def goes_with(self, other: Frame) -> bool:
-        """Whether both are the same frame, or lie on the same way."""
-        return self is other or (self.ends is not None and self.ends == other.ends and self._turning == other._turning)
+    def continues(self, other: Frame) -> bool:
+        """Whether both are the same frame, or interpolated between the same ends with the same rule for rotation."""
+        return self is other or (
+            self.ends is not None and self.ends == other.ends and self._constant_turn == other._constant_turn
+        )
 
     @property
-    def _turning(self) -> float | None:
-        """What of the angle it is turned, where that does not grow along the way."""
+    def _constant_turn(self) -> float | None:
+        """``turn``, where it does not grow with ``share``."""
         return None if self.turn == self.share else self.turn
 
 
@@ -95,13 +98,12 @@ WORLD = Frame("world")
 
 
 def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArray:
-    """Pose ``(4, 4)`` that puts ``shape (N, 3)`` onto ``points (N, 3)``, whatever a minority of wrong points says.
+    """Pose ``(4, 4)`` that maps ``shape (N, 3)`` onto ``points (N, 3)``, robust to a minority of outliers.
 
-    The smallest subsets that fix a pose are tried; the one that most points agree with is refined by
-    reweighted least squares.
+    The best of all minimal subsets, refined by iteratively reweighted least squares.
     """
     size = 2 if upright else 3
-    fit = _fit_upright if upright else fit_rigid
+    fit = fit_upright if upright else fit_rigid
     if len(shape) > size:
         subsets = np.array(list(combinations(range(len(shape)), size)))
         starts = fit(shape[subsets], points[subsets], np.ones(subsets.shape))
@@ -137,25 +139,12 @@ def _moved(poses: FloatArray, points: FloatArray) -> FloatArray:
     return points @ np.swapaxes(poses[..., :3, :3], -1, -2) + poses[..., None, :3, 3]
 
 
-def _fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
-    """Weighted least-squares pose that turns about the vertical only; batched like `fit_rigid`."""
-    share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
-    source_mean = (share * source).sum(axis=-2, keepdims=True)
-    target_mean = (share * target).sum(axis=-2, keepdims=True)
-    a, b = source - source_mean, target - target_mean
-    sine = (share[..., 0] * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])).sum(axis=-1)
-    cosine = (share[..., 0] * (a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1])).sum(axis=-1)
-    pose = _turned(np.arctan2(sine, cosine))
-    pose[..., :3, 3] = target_mean[..., 0, :] - (pose[..., :3, :3] @ np.swapaxes(source_mean, -1, -2))[..., 0]
-    return pose
-
-
 def candidate_frames(keypoints: FloatArray) -> list[Frame]:
     """Frames worth trying for demonstrations with ``keypoints (I, K, 3)``.
 
     Keypoints belong together when their distance is nearly the same in most demonstrations. Each keypoint gives a
-    frame of its own, and upright and rigid frames on all that belong with it and on the nearest few of them. Between
-    the world and the objects, each the largest such frame, lie the frames of the ways between them.
+    frame of its own, and upright and rigid frames on all that belong with it and on the nearest few of them. Frames
+    are interpolated between the world and the objects, each the largest such frame.
     """
     num_demos, num_points = keypoints.shape[:2]
     frames = [WORLD, *(Frame("keypoint", (k,)) for k in range(num_points))]
@@ -181,39 +170,39 @@ def candidate_frames(keypoints: FloatArray) -> list[Frame]:
     if num_demos >= DEMOS_TO_TELL_OBJECTS:
         for ends in combinations([WORLD, *_objects(frames)], 2):
             members = ends[0].members + ends[1].members
-            for share in SHARES:
+            for share in INTERPOLATION_SHARES:
                 frames.extend(Frame("between", members, None, ends, share, turn) for turn in (0.0, share, 1.0))
     return frames
 
 
 def _objects(frames: Sequence[Frame]) -> list[Frame]:
-    """The upright frames on the most keypoints that share none, at most `MOST_OBJECTS`."""
+    """The upright frames on the most keypoints that share none, at most `MAX_INTERPOLATED_OBJECTS`."""
     objects: list[Frame] = []
     for frame in sorted(frames, key=lambda frame: -len(frame.members)):
         taken = {member for other in objects for member in other.members}
         if frame.kind == "upright" and taken.isdisjoint(frame.members):
             objects.append(frame)
-    return objects[:MOST_OBJECTS]
+    return objects[:MAX_INTERPOLATED_OBJECTS]
 
 
 def poses_in(frames: Sequence[Frame], keypoints: FloatArray) -> FloatArray:
     """Pose of each of ``frames`` in each scene of ``keypoints (I, K, 3)``: ``(F, I, 4, 4)``."""
-    known: dict[int, FloatArray] = {}
+    known: dict[Frame, FloatArray] = {}  # interpolated frames share their ends
 
     def poses(frame: Frame) -> FloatArray:
-        if id(frame) not in known:
+        if frame not in known:
             if frame.ends is None:
-                known[id(frame)] = np.stack([frame.pose(points) for points in keypoints])
+                known[frame] = np.stack([frame.pose(points) for points in keypoints])
             else:
                 first, second = frame.ends
-                known[id(frame)] = _between(poses(first), poses(second), frame.share, frame.turn)
-        return known[id(frame)]
+                known[frame] = _between(poses(first), poses(second), frame.share, frame.turn)
+        return known[frame]
 
     return np.stack([poses(frame) for frame in frames])
 
 
 def _mean_shape(points: FloatArray, upright: bool) -> FloatArray:
-    """The shape ``(N, 3)`` about its middle of which ``points (I, N, 3)`` are noisy, moved copies."""
+    """The centred shape ``(N, 3)`` of which ``points (I, N, 3)`` are noisy, moved copies."""
     distances = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
     typical = int(np.argmin(np.abs(distances - np.median(distances, axis=0)).sum(axis=(1, 2))))
     shape = points[typical]
@@ -226,8 +215,7 @@ def _mean_shape(points: FloatArray, upright: bool) -> FloatArray:
 
 
 def spread(values: FloatArray) -> FloatArray:
-    """Standard deviation over the first axis: from the median absolute deviation where there are enough values for
-    one wrong one not to matter, the plain one where each counts."""
+    """Standard deviation over the first axis; from `DEMOS_FOR_MEDIANS` values on from the median absolute deviation."""
     if len(values) < DEMOS_FOR_MEDIANS:
         return values.std(axis=0)
     return MAD_TO_STD * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
@@ -239,7 +227,7 @@ def choose_frames(
     """Which of ``frames`` each step is written in.
 
     ``poses (F, I, 4, 4)`` are the frames in each demonstration's scene, ``points (I, T, P, 3)`` the gripper's points.
-    Minimises the summed log spread of the points in their frames plus a price for each change (Viterbi).
+    Minimises the summed log spread of the points in their frames plus a cost for each transition (Viterbi).
     """
     inverse_rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
     offset = points[None] - poses[:, :, None, None, :3, 3]
@@ -251,16 +239,16 @@ def choose_frames(
     for own, frame in zip(cost, frames, strict=True):
         own += FEW_POINTS_COST / max(len(frame.members), 1) * (frame.kind != "world")
         own += TILT_COST * (frame.kind == "rigid")
-        own += (BETWEEN_COST + BETWEEN_COST_OF_FEW / points.shape[0]) * (frame.kind == "between")
+        own += (INTERPOLATED_COST + INTERPOLATED_COST_FEW_DEMOS / points.shape[0]) * (frame.kind == "between")
     weight = np.ones(points.shape[1])
     weight[list(key_steps)] = KEY_STEP_WEIGHT
     cost = cost * weight
 
-    change = np.array([[_change(frame, other) for other in frames] for frame in frames])
+    transition = np.array([[_transition_cost(frame, other) for other in frames] for frame in frames])
     total = cost[:, 0]
     origin = np.zeros((len(frames), points.shape[1]), dtype=np.intp)
     for step in range(1, points.shape[1]):
-        reached = total[:, None] + change
+        reached = total[:, None] + transition
         origin[:, step] = reached.argmin(axis=0)
         total = reached.min(axis=0) + cost[:, step]
     chosen = [int(np.argmin(total))]
@@ -269,11 +257,11 @@ def choose_frames(
     return chosen[::-1]
 
 
-def _change(frame: Frame, other: Frame) -> float:
-    """The price of writing one step in ``frame`` and the next in ``other``."""
+def _transition_cost(frame: Frame, other: Frame) -> float:
+    """The cost of writing one step in ``frame`` and the next in ``other``."""
     if frame is other:
         return 0.0
-    if frame.goes_with(other):
-        return ALONG_COST
-    boards = (frame.ends is not None and other in frame.ends) or (other.ends is not None and frame in other.ends)
-    return BOARDING_COST if boards else SWITCH_COST
+    if frame.continues(other):
+        return SAME_ENDPOINTS_TRANSITION_COST
+    to_endpoint = (frame.ends is not None and other in frame.ends) or (other.ends is not None and frame in other.ends)
+    return ENDPOINT_TRANSITION_COST if to_endpoint else TRANSITION_COST

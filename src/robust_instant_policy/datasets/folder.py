@@ -1,14 +1,20 @@
-"""The tables of a LeRobotDataset v3.0 folder, ours or anyone's, with everything that can be wrong said in one line."""
+"""The tables of a LeRobotDataset v3.0 folder, ours or anyone's, with everything that can be wrong said in one line.
+
+A folder may come from anywhere, so what it says is checked once, when it is read: types and ranges of what
+``meta/info.json`` and ``meta/episodes`` say, and that every path they lead to stays inside the folder.
+"""
 
 from __future__ import annotations
 
-import json
+import math
+import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -16,18 +22,23 @@ from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
 from robust_instant_policy.datasets.video import decode_video
+from robust_instant_policy.demonstration import MAX_PIXELS
 from robust_instant_policy.errors import DatasetError, NoDemonstrationsError
-from robust_instant_policy.files import finished_files
+from robust_instant_policy.files import excerpt, finished_files, open_regular, read_json
+from robust_instant_policy.geometry import FloatArray
 
 CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
 STATISTICS_PREFIX = "stats/"  # columns of meta/episodes that only those who normalise need
 INFO_ENTRIES = ("codebase_version", "fps", "features", "total_episodes", "total_frames", "data_path")
+MAX_INDEX = 2**31  # of an episode, file, chunk or frame
+MAX_VALUES = 2**28  # numbers in the columns read from one file; v3.0 aims at files of 100 MB
+REPAIR = "restore it, or record the folder again"
 
 
 @dataclass(frozen=True)
 class Folder:
     """A LeRobotDataset v3.0: ``info`` is its ``meta/info.json``, ``episodes`` the rows of ``meta/episodes`` in order,
-    without statistics.
+    without statistics, both checked.
 
     Its tables are read when asked for; every method raises `DatasetError`, naming the file, for one that is
     missing or damaged.
@@ -49,33 +60,59 @@ class Folder:
     def columns(self, episode: int, names: Sequence[str]) -> pa.Table:
         """The frames of an episode, in order."""
         row = self.episodes[episode]
-        path = self.root / self.info["data_path"].format(
-            chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
-        )
+        path = self._path("data_path", chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
         table = _read_data(path, tuple(names), _stamp(path))
         table = table.filter(pc.equal(table["episode_index"], row["episode_index"])).sort_by("frame_index")
         if len(table) != row["length"]:
             raise DatasetError(
-                f"{path} is damaged: episode {episode} has {len(table)} of its {row['length']} frames; "
-                "restore it, or record the folder again"
+                f"{path} is damaged: episode {episode} has {len(table)} of its {row['length']} frames; {REPAIR}"
             )
+        if not np.array_equal(table["frame_index"], np.arange(row["length"])):
+            raise DatasetError(f"{path} is damaged: frame_index of episode {episode} is not 0, 1, 2, …; {REPAIR}")
         return table
+
+    def matrix(self, episode: int, name: str) -> FloatArray:
+        """A feature of numbers over the frames of an episode ``(T, D)``, in order."""
+        column = self.columns(episode, [name])[name].combine_chunks()
+        try:
+            return _matrix(column)
+        except (ValueError, pa.ArrowException) as error:
+            raise DatasetError(
+                f"{self.root} is damaged: episode {episode}: {name} {excerpt(error)}; {REPAIR}"
+            ) from None
 
     def frames(self, episode: int, key: str) -> Iterator[NDArray]:
         """Images ``(H, W, 3)`` uint8 of an episode's video feature ``key``, in order."""
         row = self.episodes[episode]
-        path = self.root / self.info["video_path"].format(
-            video_key=key, chunk_index=row[f"videos/{key}/chunk_index"], file_index=row[f"videos/{key}/file_index"]
+        video = f"videos/{key}"
+        wanted = {f"{video}/{name}": low for name, low in (("chunk_index", 0), ("file_index", 0))}
+        _check_whole_numbers(self.root, episode, row, wanted)
+        start, stop = (row.get(f"{video}/{name}") for name in ("from_timestamp", "to_timestamp"))
+        if not (isinstance(start, float | int) and isinstance(stop, float | int) and 0 <= start < stop < math.inf):
+            raise DatasetError(
+                f"{self.root} is damaged: episode {episode} of {excerpt(video)} lasts from {reprlib.repr(start)} "
+                f"to {reprlib.repr(stop)} s; {REPAIR}"
+            )
+        path = self._path(
+            "video_path",
+            video_key=key,
+            chunk_index=row[f"{video}/chunk_index"],
+            file_index=row[f"{video}/file_index"],
         )
         count = 0
-        for image in decode_video(path, row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"]):
-            yield image
+        for image in decode_video(path, start, stop):
             count += 1
+            if count > row["length"]:
+                break
+            yield image
         if count != row["length"]:
-            raise DatasetError(
-                f"{path} is damaged: episode {episode} has {count} of its {row['length']} images; "
-                "restore it, or record the folder again"
-            )
+            found = f"{count} of its" if count < row["length"] else "more images than its"
+            raise DatasetError(f"{path} is damaged: episode {episode} has {found} {row['length']} images; {REPAIR}")
+
+    def _path(self, template: str, **fields: object) -> Path:
+        if self.info.get(template) is None:
+            raise DatasetError(f"{self.root / layout.INFO_PATH} lacks {template}; {REPAIR}")
+        return inside(self.root, self.info[template].format(**fields))
 
 
 def open_folder(path: Path, task: str | None = None) -> Folder:
@@ -95,49 +132,106 @@ def open_folder(path: Path, task: str | None = None) -> Folder:
         if (path / layout.RIP_PATH).exists():
             raise NoDemonstrationsError(f"{path} holds no finished demonstration yet; {advice}")
         raise DatasetError(f"{path} is no demonstrations folder: it has no {layout.INFO_PATH}; {advice}")
-    info = read_json(path / layout.INFO_PATH)
+    file = inside(path, layout.INFO_PATH)
+    info = read_json(file)
     missing = [entry for entry in INFO_ENTRIES if entry not in info]
     if missing:
-        raise DatasetError(f"{path / layout.INFO_PATH} lacks {', '.join(missing)}; restore it, or record again")
-    version = str(info["codebase_version"])
-    if not version.startswith("v3."):
+        raise DatasetError(f"{file} lacks {', '.join(missing)}; restore it, or record again")
+    version = info["codebase_version"]
+    if not (isinstance(version, str) and version.startswith("v3.")):
         convert = f"; convert it with: {CONVERTER} --repo-id=NAME --root={path} --push-to-hub=false"
         raise DatasetError(
-            f"{path} is a LeRobotDataset {version}, and {layout.CODEBASE_VERSION} is needed"
+            f"{path} is a LeRobotDataset {reprlib.repr(version)}, and {layout.CODEBASE_VERSION} is needed"
             + (convert if version == "v2.1" else "")
         )
+    try:
+        _check_info(info)
+    except ValueError as error:
+        raise DatasetError(f"{file} is damaged: {error}; {REPAIR}") from None
     if info["total_episodes"] < 1:
         raise NoDemonstrationsError(f"{path} holds no demonstrations; {advice}")
     return Folder(path, info, _read_episodes(path, info["total_episodes"]))
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object. Raises `DatasetError` naming the file."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{path} cannot be read as JSON: restore it, or record the folder again") from error
-    if not isinstance(content, dict):
-        raise DatasetError(f"{path} must hold a JSON object: restore it, or record the folder again")
-    return content
+def read_recording(root: Path) -> dict[str, Any]:
+    """What ``meta/rip.json`` says about our own folders, checked. Raises `DatasetError` naming the file."""
+    file = inside(root, layout.RIP_PATH)
+    own = read_json(file)
+    seeds = own.get("discarded_seeds", [])
+    if not isinstance(own.get("task"), str) or not isinstance(own.get("description", ""), str):
+        raise DatasetError(f"{file} is damaged: its task and description must be text; {REPAIR}")
+    if not isinstance(seeds, list) or not all(seed is None or _is_whole(seed) for seed in seeds):
+        raise DatasetError(f"{file} is damaged: its discarded_seeds must be a list of whole numbers; {REPAIR}")
+    return own
 
 
-def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """A parquet file, or only some of its ``columns``. Raises `DatasetError` naming the file."""
+def read_seed(row: Mapping[str, Any]) -> int | None:
+    """The seed that our own folders keep in a row of ``meta/episodes``. Raises `DatasetError` for anything else."""
+    seed = row.get(layout.SEED_COLUMN)
+    if seed is not None and not isinstance(seed, int):
+        raise DatasetError(
+            f"{layout.SEED_COLUMN} of an episode must be a whole number, got {reprlib.repr(seed)}; {REPAIR}"
+        )
+    return seed
+
+
+def inside(root: Path, relative: str | Path) -> Path:
+    """The path of a file of the folder. Raises `DatasetError` for one that leads out of it, also by symbolic links."""
+    path = root / relative
     try:
-        table = pq.read_table(path, columns=None if columns is None else list(columns), partitioning=None)
-    except (OSError, pa.ArrowException) as error:
+        within = path.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a name too long, a null character
+        raise DatasetError(f"{root} names a file that cannot be: {excerpt(relative)!r} ({excerpt(error)})") from None
+    if not within:
+        raise DatasetError(
+            f"{root} names a file outside of itself: {excerpt(relative)!r}; "
+            "where these are symbolic links of your own, copy the folder with: cp -rL"
+        )
+    return path
+
+
+def read_table(path: Path, columns: Sequence[str] | None = None, skip: str | None = None) -> pa.Table:
+    """A parquet file, or only some of its ``columns``, or those that do not begin with ``skip``.
+
+    Raises `DatasetError` naming the file.
+    """
+    try:
+        with open_regular(path) as file, pq.ParquetFile(file) as parquet:
+            there = parquet.schema_arrow.names
+            lacking = [name for name in columns or () if there.count(name) != 1]
+            if lacking:
+                raise DatasetError(f"{path} has no column {', '.join(lacking)}, or more than one")
+            wanted = list(columns or [name for name in there if skip is None or not name.startswith(skip)])
+            count = _count_values(parquet.metadata, set(wanted))
+            if count > MAX_VALUES:
+                raise DatasetError(
+                    f"{path} declares {count} numbers, more than the {MAX_VALUES} of a file of a dataset"
+                )
+            return parquet.read(columns=wanted)
+    except (OSError, ValueError, KeyError, OverflowError, MemoryError, pa.ArrowException) as error:
         reason = "is missing" if isinstance(error, FileNotFoundError) else "is damaged or cut short"
-        raise DatasetError(f"{path} {reason}: restore it, or record the folder again") from error
-    lacking = [name for name in columns or () if name not in table.column_names]
-    if lacking:
-        raise DatasetError(f"{path} has no column {', '.join(lacking)}")
-    return table
+        raise DatasetError(f"{path} {reason}: {REPAIR}") from error
+
+
+def _count_values(metadata: pq.FileMetaData, names: set[str]) -> int:
+    """Numbers in the columns called ``names``, as the file declares them."""
+    count = metadata.num_rows
+    for group in range(metadata.num_row_groups):
+        columns = metadata.row_group(group)
+        for index in range(columns.num_columns):
+            column = columns.column(index)
+            if any(column.path_in_schema == name or column.path_in_schema.startswith(f"{name}.") for name in names):
+                count += column.num_values
+    return count
 
 
 @lru_cache(maxsize=1)  # files that hold many episodes are read once, not once for each
 def _read_data(path: Path, names: tuple[str, ...], stamp: tuple[int, ...]) -> pa.Table:
-    return read_table(path, ["episode_index", "frame_index", *names])
+    table = read_table(path, ["episode_index", "frame_index", *names])
+    for name in ("episode_index", "frame_index"):
+        if not pa.types.is_integer(table[name].type):
+            raise DatasetError(f"{path} is damaged: {name} is {table[name].type}, not whole numbers; {REPAIR}")
+    return table
 
 
 def _stamp(path: Path) -> tuple[int, ...]:
@@ -149,18 +243,77 @@ def _stamp(path: Path) -> tuple[int, ...]:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
+def _matrix(column: pa.Array) -> FloatArray:
+    """``(T, D)`` of a column of numbers or of lists of numbers of one length; `ValueError` for any other."""
+    count = len(column)
+    if column.null_count:
+        raise ValueError("has gaps")
+    if pa.types.is_list(column.type) or pa.types.is_large_list(column.type) or pa.types.is_fixed_size_list(column.type):
+        if len(pc.unique(pc.list_value_length(column))) > 1:
+            raise ValueError("has rows of different lengths")
+        column = column.flatten()
+    if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)) or column.null_count:
+        raise ValueError(f"holds {column.type}, or gaps, in place of numbers")
+    return column.to_numpy(zero_copy_only=False).astype(np.float64).reshape(count, -1)
+
+
+def _check_info(info: Mapping[str, Any]) -> None:
+    """Raises `ValueError` unless the entries of ``meta/info.json`` that are used have their types and ranges."""
+    fps = info["fps"]
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps < MAX_INDEX:
+        raise ValueError(f"fps must be a positive number, got {reprlib.repr(fps)}")
+    for name in ("total_episodes", "total_frames"):
+        if not _is_whole(info[name]):
+            raise ValueError(f"{name} must be a whole number, got {reprlib.repr(info[name])}")
+    for name, fields in (("data_path", layout.INDICES), ("video_path", (*layout.INDICES, "video_key"))):
+        template = info.get(name)
+        if template is None and name == "video_path":
+            continue
+        if not isinstance(template, str):
+            raise ValueError(f"{name} must be a path template, got {reprlib.repr(template)}")
+        layout.check_template(template, fields)
+    if not isinstance(info["features"], dict):
+        raise ValueError(f"features must be an object, got {reprlib.repr(info['features'])}")
+    for key, feature in info["features"].items():
+        if not (isinstance(feature, dict) and isinstance(feature.get("dtype"), str)):
+            raise ValueError(f"the feature {excerpt(key)!r} must have a dtype, got {reprlib.repr(feature)}")
+        shape = feature.get("shape")
+        if not (
+            isinstance(shape, list) and all(_is_whole(side) for side in shape) and math.prod(shape) < 4 * MAX_PIXELS
+        ):
+            raise ValueError(f"the feature {excerpt(key)!r} must have a shape, got {reprlib.repr(shape)}")
+
+
+def _is_whole(value: object, least: int = 0) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value < MAX_INDEX
+
+
 def _read_episodes(root: Path, count: int) -> list[dict[str, Any]]:
     """The first ``count`` rows: what lies beyond was not finished when its writer was killed."""
     rows: list[dict[str, Any]] = []
     for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
-        table = read_table(path)
-        rows += table.select(
-            [name for name in table.column_names if not name.startswith(STATISTICS_PREFIX)]
-        ).to_pylist()
+        table = read_table(inside(root, path.relative_to(root)), skip=STATISTICS_PREFIX)
+        try:
+            rows += table.to_pylist()
+        except (ValueError, OverflowError, pa.ArrowException) as error:
+            raise DatasetError(f"{path} is damaged ({excerpt(error)}); {REPAIR}") from None
         if len(rows) >= count:
             break
-    if [row["episode_index"] for row in rows[:count]] != list(range(count)):
+    if len(rows) < count or [row.get("episode_index") for row in rows[:count]] != list(range(count)):
         raise DatasetError(
-            f"{root} is damaged: meta/episodes lists {len(rows)} of {count} episodes; restore it, or record again"
+            f"{root} is damaged: meta/episodes lists {len(rows)} of {count} episodes, or out of order; "
+            "restore it, or record again"
         )
+    for episode, row in enumerate(rows[:count]):
+        _check_whole_numbers(root, episode, row, {"length": 1, "data/chunk_index": 0, "data/file_index": 0})
     return rows[:count]
+
+
+def _check_whole_numbers(root: Path, episode: int, row: Mapping[str, Any], least: Mapping[str, int]) -> None:
+    """Raises `DatasetError` unless the entries of a row are whole numbers, each at least as large as given."""
+    for name, low in least.items():
+        if not _is_whole(row.get(name), low):
+            raise DatasetError(
+                f"{root} is damaged: {name} of episode {episode} is {reprlib.repr(row.get(name))}, not a whole number; "
+                "restore it, or record again"
+            )

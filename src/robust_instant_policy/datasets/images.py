@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import io
+import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from robust_instant_policy.demonstration import MAX_PIXELS
 from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.files import open_regular
 
 FINE_UNIT_M = 1e-4  # one step of 16-bit depth; reaches 6.5 m
 COARSE_UNIT_M = 1e-3  # for cameras that read further; reaches 65.5 m
+REPAIR = "restore it, or record the folder again"
 MAX_STEPS = np.iinfo(np.uint16).max
+
+
+# What Pillow raises for content that is damaged, or declares more pixels than anyone takes.
+DAMAGE = (OSError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError, Image.DecompressionBombWarning)
 
 
 def encode_png(image: NDArray) -> bytes:
@@ -50,15 +59,31 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
 
 def read_depth(path: Path, unit: float) -> NDArray[np.float32]:
     """Depth ``(H, W)`` float32 metres, NaN where there is no reading."""
-    steps = np.asarray(_open(path)).astype(np.float64)
+    image = _open(path)
+    if image.mode != "I;16":
+        raise DatasetError(f"{path} must be a depth image of 16 bits, got {image.mode}: {REPAIR}")
+    steps = np.asarray(image).astype(np.float64)
     steps[steps == 0] = np.nan
     return (steps * unit).astype(np.float32)
 
 
 def _open(path: Path) -> Image.Image:
     try:
-        with Image.open(path) as image:
-            image.load()
-            return image
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DatasetError(f"{path} cannot be read as an image: restore it, or record the folder again") from error
+        with open_regular(path) as file:
+            return decode_image(file.read(), ("PNG",))
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path} cannot be read as an image: {REPAIR}") from error
+
+
+def decode_image(content: bytes, formats: tuple[str, ...]) -> Image.Image:
+    """The image in a file's ``content``; raises `ValueError` for another format, and for one that is damaged."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            image = Image.open(io.BytesIO(content), formats=formats)
+        if image.width * image.height > MAX_PIXELS:
+            raise ValueError(f"it declares {image.width} x {image.height} pixels")
+        image.load()
+        return image
+    except DAMAGE as error:
+        raise ValueError(f"it is no image of the kind {' or '.join(formats)}") from error

@@ -7,6 +7,9 @@ recording only ever adds files. See ``docs/datasets.md``.
 
 from __future__ import annotations
 
+import re
+import string
+from collections.abc import Collection
 from pathlib import Path
 
 from robust_instant_policy.trajectory import ACTION_DIM
@@ -39,6 +42,27 @@ SEED_COLUMN = "rip/seed"
 INFO_COLUMN = "rip/info"
 
 
+PLAIN_NUMBER = re.compile(r"0?[1-9]?d?")  # format of an index in a path template; the format's own is 03d
+INDICES = ("chunk_index", "file_index")
+
+
+def check_template(template: str, fields: Collection[str]) -> None:
+    """Raises `ValueError` unless a path template consists of text and of the ``fields``, in plain formats.
+
+    What remains is safe to format: no attributes or items of the values, no widths of any size.
+    """
+    try:
+        parts = list(string.Formatter().parse(template))
+    except ValueError as error:
+        raise ValueError(f"the path template {template[:100]!r} is none: {error}") from None
+    for _, field, spec, conversion in parts:
+        if field is None:
+            continue
+        plain = PLAIN_NUMBER.fullmatch(spec or "") if field in INDICES else not spec
+        if field not in fields or conversion or not plain:
+            raise ValueError(f"the path template {template[:100]!r} holds more than {', '.join(fields)}")
+
+
 def chunk_and_file(episode: int) -> tuple[int, int]:
     """Chunk and file index of an episode's own files."""
     return divmod(episode, FILES_PER_CHUNK)
@@ -51,7 +75,7 @@ def episode_path(pattern: str, episode: int) -> Path:
 
 
 def axis_names(num_arms: int) -> list[str]:
-    """Names of the ``10·A`` action dimensions, in order."""
+    """Names of the ``10·A`` action dimensions on disk, in order; "palm" is the gripper point."""
     points = [f"{point}.{axis}" for point in ("palm", "finger_1", "finger_2") for axis in "xyz"]
     names = [*points, "gripper"]
     assert len(names) == ACTION_DIM

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.folder import Folder, open_folder, read_json
+from robust_instant_policy.datasets.folder import Folder, inside, open_folder, read_recording, read_seed
 from robust_instant_policy.datasets.images import read_depth, read_rgb
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.files import excerpt
+from robust_instant_policy.geometry import FloatArray, as_numbers
 from robust_instant_policy.trajectory import Trajectory
 
 
@@ -35,11 +36,11 @@ def load_demonstrations(path: str | Path, task: str | None = None, limit: int | 
             f"{root} was not recorded by rip: it holds no start-of-episode depth and camera ({layout.RIP_PATH}); "
             "if its actions are end-effector poses, convert it with robust_instant_policy.datasets.importers"
         )
-    recorded = read_json(root / layout.RIP_PATH)
-    name = str(recorded.get("task", ""))
+    name = read_recording(root)["task"]
     if task is not None and name != task:
         raise DatasetError(
-            f"{root} holds demonstrations of {name!r}, not of {task!r}; choose another folder, or --task {name}"
+            f"{root} holds demonstrations of {excerpt(name)!r}, not of {task!r}; "
+            f"choose another folder, or --task {excerpt(name)}"
         )
     count = len(folder.episodes) if limit is None else min(limit, len(folder.episodes))
     return [_read_demonstration(folder, episode, name) for episode in range(count)]
@@ -60,30 +61,55 @@ def load_frames(path: str | Path, episode: int) -> Iterator[NDArray[np.uint8]]:
 
 def _read_demonstration(folder: Folder, episode: int, task: str) -> Demonstration:
     row = folder.episodes[episode]
-    actions = np.array(folder.columns(episode, [layout.ACTION_KEY])[layout.ACTION_KEY].to_pylist())
+    actions = folder.matrix(episode, layout.ACTION_KEY)
+    rgb_path, depth_path = (
+        inside(folder.root, layout.episode_path(pattern, episode))
+        for pattern in (layout.START_RGB_PATTERN, layout.START_DEPTH_PATTERN)
+    )
     try:
         observation = Observation(
-            rgb=read_rgb(folder.root / layout.episode_path(layout.START_RGB_PATTERN, episode)),
-            depth=read_depth(
-                folder.root / layout.episode_path(layout.START_DEPTH_PATTERN, episode), row[layout.DEPTH_UNIT_COLUMN]
-            ),
-            intrinsics=np.array(row[layout.INTRINSICS_COLUMN]).reshape(3, 3),
-            camera_pose=np.array(row[layout.CAMERA_POSE_COLUMN]).reshape(4, 4),
+            rgb=read_rgb(rgb_path),
+            depth=read_depth(depth_path, _depth_unit(row[layout.DEPTH_UNIT_COLUMN])),
+            intrinsics=_square(row[layout.INTRINSICS_COLUMN], 3),
+            camera_pose=_square(row[layout.CAMERA_POSE_COLUMN], 4),
         )
         return Demonstration(
             observation,
             Trajectory.from_actions(actions),
             folder.rate_hz,
             task,
-            row[layout.SEED_COLUMN],
-            _info(row),
+            read_seed(row),
+            _info(row[layout.INFO_COLUMN]),
             partial(folder.frames, episode, layout.VIDEO_KEY) if layout.VIDEO_KEY in folder.video_keys else None,
         )
-    except (InvalidValueError, KeyError, ValueError) as error:
+    except KeyError as error:
         raise DatasetError(
-            f"{folder.root} is damaged: episode {episode}: {error}; restore it, or record again"
+            f"{folder.root} is damaged: meta/episodes lacks {excerpt(error)}; restore it, or record again"
+        ) from None
+    except (InvalidValueError, ValueError) as error:
+        raise DatasetError(
+            f"{folder.root} is damaged: episode {episode}: {excerpt(error)}; restore it, or record again"
         ) from error
 
 
-def _info(row: Mapping[str, Any]) -> dict[str, str | float | int]:
-    return json.loads(row[layout.INFO_COLUMN])
+def _depth_unit(value: object) -> float:
+    if not (isinstance(value, float) and 0 < value < np.inf):
+        raise ValueError(f"{layout.DEPTH_UNIT_COLUMN} must be a positive number, got {value!r}")
+    return value
+
+
+def _square(values: object, side: int) -> FloatArray:
+    if not (isinstance(values, list) and len(values) == side * side):
+        raise ValueError(f"a matrix of {side} x {side} numbers is not one")
+    return as_numbers("a matrix", values).reshape(side, side)
+
+
+def _info(text: object) -> dict[str, str | float | int]:
+    """Further facts on an episode, written as JSON."""
+    try:
+        facts = json.loads(text) if isinstance(text, str) else None
+    except (ValueError, RecursionError):
+        facts = None
+    if not isinstance(facts, dict) or not all(isinstance(fact, str | float | int) for fact in facts.values()):
+        raise ValueError(f"{layout.INFO_COLUMN} must be a JSON object of strings and numbers")
+    return facts

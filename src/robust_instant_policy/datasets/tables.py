@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.folder import STATISTICS_PREFIX, read_table
+from robust_instant_policy.datasets.folder import STATISTICS_PREFIX, inside, read_table
 from robust_instant_policy.datasets.statistics import Statistics
 from robust_instant_policy.datasets.video import PIXEL_FORMAT
 from robust_instant_policy.geometry import FloatArray
@@ -69,7 +69,7 @@ def episode_table(row: Mapping[str, Any], statistics: Mapping[str, Statistics]) 
 
 def read_statistics(root: Path, episode: int) -> dict[str, Statistics]:
     """The statistics that `episode_table` wrote."""
-    table = read_table(root / layout.episode_path(layout.EPISODES_PATTERN, episode))
+    table = read_table(inside(root, layout.episode_path(layout.EPISODES_PATTERN, episode)))
     result: dict[str, dict[str, FloatArray]] = {}
     for column in table.column_names:
         if column.startswith(STATISTICS_PREFIX):

@@ -12,8 +12,9 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from robust_instant_policy.demonstration import MAX_PIXELS
 from robust_instant_policy.errors import DatasetError, InvalidValueError
-from robust_instant_policy.files import write_whole
+from robust_instant_policy.files import open_regular, write_whole
 
 CODEC = "libx264"
 PIXEL_FORMAT = "yuv420p"
@@ -119,14 +120,19 @@ def decode_video(path: Path, start_s: float = 0.0, stop_s: float = float("inf"))
     Raises `DatasetError` for a file that is not there or not a video.
     """
     try:
-        with av.open(str(path)) as container:
+        # As a file object and as MP4 only: other formats of FFmpeg name files and addresses that it would open.
+        with open_regular(path) as file, av.open(file, format="mp4") as container:
             stream = container.streams.video[0]
+            if stream.width * stream.height > MAX_PIXELS:
+                raise DatasetError(f"{path} declares images of {stream.width} x {stream.height} pixels, too large")
             half_frame = float(1 / (2 * stream.average_rate))
             container.seek(int(start_s / stream.time_base), stream=stream)
             for frame in container.decode(stream):
                 if frame.time >= stop_s - half_frame:
                     return
+                if (frame.width, frame.height) != (stream.width, stream.height):
+                    raise DatasetError(f"{path} holds images of several sizes: restore it, or record the folder again")
                 if frame.time >= start_s - half_frame:
                     yield frame.to_ndarray(format="rgb24")
-    except (OSError, ValueError, IndexError) as error:
+    except (OSError, ValueError, IndexError, TypeError, ArithmeticError, MemoryError, av.FFmpegError) as error:
         raise DatasetError(f"{path} cannot be read as a video: restore it, or record the folder again") from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.folder import Folder, open_folder, read_json
+from robust_instant_policy.datasets.folder import Folder, inside, open_folder, read_recording, read_seed
 from robust_instant_policy.datasets.images import encode_depth, encode_png
 from robust_instant_policy.datasets.statistics import Statistics, combine, feature_statistics, image_statistics
 from robust_instant_policy.datasets.tables import (
@@ -31,6 +32,7 @@ from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import (
     PART_SUFFIX,
+    excerpt,
     finished_files,
     lock_folder,
     make_folder,
@@ -99,7 +101,7 @@ class DatasetWriter:
     @property
     def last_seed(self) -> int | None:
         """The largest seed tried so far, kept or thrown away; the next one to try is one more."""
-        kept = [] if self._folder is None else [row[layout.SEED_COLUMN] for row in self._folder.episodes]
+        kept = [] if self._folder is None else [read_seed(row) for row in self._folder.episodes]
         return max((seed for seed in [*kept, *self._discarded_seeds] if seed is not None), default=None)
 
     def discard(self, seed: int | None = None) -> None:
@@ -127,13 +129,17 @@ class DatasetWriter:
     def _resume(self) -> None:
         """Take up what earlier writers finished, and remove what they did not."""
         if (self.path / layout.RIP_PATH).exists():
-            own = read_json(self.path / layout.RIP_PATH)
-            if own.get("task") != self.task:
-                raise DatasetError(f"{self.path} holds demonstrations of {own.get('task')!r}, not of {self.task!r}")
+            own = read_recording(self.path)
+            if own["task"] != self.task:
+                raise DatasetError(
+                    f"{self.path} holds demonstrations of {excerpt(own['task'])!r}, not of {self.task!r}"
+                )
             if own.get("rate_hz") != self.rate_hz:
-                raise DatasetError(f"{self.path} was recorded at {own.get('rate_hz')} Hz, not at {self.rate_hz} Hz")
-            self.description = str(own.get("description", self.description))
-            self._discarded_seeds = list(own.get("discarded_seeds", []))
+                raise DatasetError(
+                    f"{self.path} was recorded at {reprlib.repr(own.get('rate_hz'))} Hz, not at {self.rate_hz} Hz"
+                )
+            self.description = own.get("description", self.description)
+            self._discarded_seeds = own.get("discarded_seeds", [])
             self._take_up()
             return
         stranger = next(finished_files(self.path), None)
@@ -148,13 +154,19 @@ class DatasetWriter:
         if (self.path / layout.INFO_PATH).exists():
             self._folder = open_folder(self.path, self.task)
             for episode in range(self.num_episodes):
-                self._statistics = _combined(self._statistics, read_statistics(self.path, episode))
+                try:
+                    self._statistics = _combined(self._statistics, read_statistics(self.path, episode))
+                except (KeyError, ValueError, TypeError, IndexError) as error:
+                    raise DatasetError(
+                        f"{self.path} is damaged: the statistics of episode {episode} are not as written "
+                        f"({excerpt(error)}); restore it, or choose another folder"
+                    ) from None
         self._remove_unfinished(self.num_episodes)
 
     def _remove_unfinished(self, count: int) -> None:
         """Remove the files of episode ``count``, the one under way; those of any other mean damage, and stay."""
         unfinished = []
-        for file in (file for top in (*layout.EPISODE_FOLDERS, "meta") for file in (self.path / top).rglob("*")):
+        for file in (file for top in (*layout.EPISODE_FOLDERS, "meta") for file in inside(self.path, top).rglob("*")):
             match = EPISODE_FILE.search(file.as_posix())
             episode = int(match[1]) * layout.FILES_PER_CHUNK + int(match[2]) if match else -1
             if episode > count:
@@ -209,7 +221,7 @@ class DatasetWriter:
     ) -> tuple[Folder, dict[str, Statistics]]:
         """Write an episode, its own files first; the folder and its statistics with it."""
         episode = self.num_episodes
-        first_frame = 0 if self._folder is None else int(self._folder.info["total_frames"])
+        first_frame = 0 if self._folder is None else self._folder.info["total_frames"]
         length = len(demonstration.trajectory)
         columns = self._frame_columns(demonstration, episode, first_frame)
         statistics: dict[str, Statistics] = {

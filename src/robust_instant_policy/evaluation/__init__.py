@@ -1,12 +1,12 @@
-"""Evaluation: suites of rollouts done by workers, rows, statistics, failure analysis, tables and figures."""
+"""Evaluation: suites of rollouts done by workers, one store of results, statistics and failure analysis."""
 
-from robust_instant_policy.evaluation.episodes import Episode, open_episodes
+from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.experiment import Progress, run_suites
-from robust_instant_policy.evaluation.failures import Failure, open_failures
+from robust_instant_policy.evaluation.failures import Failure
 from robust_instant_policy.evaluation.merging import merge
-from robust_instant_policy.evaluation.rows import RowFile
 from robust_instant_policy.evaluation.scenes import obtain_demonstrations, scene_seed
 from robust_instant_policy.evaluation.statistics import wilson_interval
+from robust_instant_policy.evaluation.store import Results, ResultsStore, export_results, holds_results, read_results
 from robust_instant_policy.evaluation.suites import SUITE_NAMES, Choice, Suite, make_suites
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.evaluation.work import STORE_FILE, Analysis, Setup
@@ -19,16 +19,18 @@ __all__ = [
     "Episode",
     "Failure",
     "Progress",
-    "RowFile",
+    "Results",
+    "ResultsStore",
     "Scene",
     "Setup",
     "Suite",
     "Variant",
+    "export_results",
+    "holds_results",
     "make_suites",
     "merge",
     "obtain_demonstrations",
-    "open_episodes",
-    "open_failures",
+    "read_results",
     "run_suites",
     "scene_seed",
     "wilson_interval",

@@ -6,17 +6,18 @@ beside the rows, on the machine where the command runs; outcomes come back one b
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import time
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import MissingExtraError, UsageError
-from robust_instant_policy.evaluation.processes import ONE_THREAD
-from robust_instant_policy.evaluation.work import Agenda, Outcome, SceneWork, Setup, Trouble
+from robust_instant_policy.evaluation.work import Outcome, SceneWork, Setup
 from robust_instant_policy.evaluation.workbench import Workbench
+from robust_instant_policy.evaluation.workers import ONE_THREAD, Died, Finished, Message, Worker, WorkError, run_pool
 from robust_instant_policy.llm import SampleStore
 
 CORES_A_WORKER = 1
@@ -24,21 +25,19 @@ LOOK_SECONDS = 2.0  # between two looks at whether a worker can be had by now
 
 
 @dataclass(frozen=True)
-class Cluster:
+class RayWorkers:
     """Up to ``count`` workers (None: one a core) on the Ray cluster at ``address`` ("auto": this machine's)."""
 
     address: str
     count: int | None = None
 
     def __call__(self, setup: Setup, works: list[SceneWork]) -> Iterator[Outcome]:
-        """Do ``works``. What a lost worker, alone or with its machine, had not finished is done elsewhere.
+        """Do ``works``; a machine that is lost is a death of its workers.
 
-        Raises `MissingExtraError` without Ray, `UsageError` where there is no cluster at the address, and `RipError`
-        with the words of an error that a worker met.
+        Raises `MissingExtraError` without Ray, and `UsageError` where there is no cluster at the address.
         """
         try:
             import ray
-            from ray.exceptions import RayActorError
         except ModuleNotFoundError as error:
             raise MissingExtraError("ray", "distributed") from error
         try:
@@ -48,89 +47,72 @@ class Cluster:
                 f"no Ray cluster at {self.address!r} ({error}); start one with: ray start --head"
             ) from None
         try:
-            agenda = Agenda(works)
-            team = _Team(setup, _most_demonstrations(setup, works))
-            at_work: dict[Any, _Member] = {}
-            while agenda or at_work:
-                wanted = len(agenda) + len(at_work)
-                team.grow(wanted if self.count is None else min(wanted, self.count))
-                for member in team.free(at_work.values()):
-                    work = agenda.next(member.task, [other.task for other in at_work.values()])
-                    if work is not None:
-                        at_work[member.give(work)] = member
-                ready, _ = ray.wait(list(at_work), timeout=LOOK_SECONDS) if at_work else ([], [])
-                for reference in ready:
-                    member = at_work[reference]
-                    try:
-                        said = ray.get(next(reference))
-                    except StopIteration:
-                        del at_work[reference]
-                    except RayActorError as error:
-                        del at_work[reference]
-                        agenda.put_back(member.left(), str(error).splitlines()[0])
-                        team.bury(member)
-                    else:
-                        if isinstance(said, Trouble):
-                            raise said.as_error()
-                        member.outcomes.append(said)
-                        yield said
+            yield from run_pool(_Actors(setup, _most_demonstrations(setup, works), self.count), works)
         finally:
             ray.shutdown()
 
 
-@dataclass(eq=False)
-class _Member:
-    """A worker actor, the scene it was given and what it has said of it."""
+@dataclass(eq=False, kw_only=True)
+class _Member(Worker):
+    """An actor, and the stream of what comes of the scene that it was given."""
 
     actor: Any
-    task: str = ""
-    work: SceneWork | None = None
-    outcomes: list[Outcome] = field(default_factory=list)
-
-    def give(self, work: SceneWork) -> Any:
-        """Has the actor begin; returns the stream of what comes of it."""
-        self.work, self.task, self.outcomes = work, work.scene.task, []
-        return self.actor.run.options(num_returns="streaming").remote(work)
-
-    def left(self) -> SceneWork:
-        assert self.work is not None
-        return self.work.without(self.outcomes)
+    said: Any = None
 
 
-@dataclass
-class _Team:
-    """Actors, as many as the cluster has room for."""
+class _Actors:
+    """A `Pool` of actors: as many as the cluster has room for, up to ``most``."""
 
-    setup: Setup
-    demonstrations: dict[str, list[Demonstration]]
-    members: list[_Member] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
+    def __init__(self, setup: Setup, demonstrations: dict[str, list[Demonstration]], most: int | None):
         import ray
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+        self._setup, self._most = setup, most
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
         keeper = ray.remote(num_cpus=0, scheduling_strategy=here)(_Keeper)
-        self._keeper = keeper.remote(self.setup.store.absolute())
-        self._shown = {task: ray.put(shown) for task, shown in self.demonstrations.items()}
+        self._keeper = keeper.remote(setup.store.absolute())
+        self._shown = {task: ray.put(shown) for task, shown in demonstrations.items()}
         self._kind = ray.remote(
             num_cpus=CORES_A_WORKER, max_restarts=0, runtime_env={"env_vars": dict(ONE_THREAD)}
         )(_Actor)  # fmt: skip
+        self._members: list[_Member] = []
 
-    def grow(self, wanted: int) -> None:
-        """Have up to ``wanted`` members, if the cluster has cores for them."""
+    def workers(self, wanted: int) -> list[_Member]:
         import ray
 
+        if self._most is not None:
+            wanted = min(wanted, self._most)
         room = int(ray.available_resources().get("CPU", 0) // CORES_A_WORKER)
-        for _ in range(min(room, wanted - len(self.members))):
-            self.members.append(_Member(self._kind.remote(self.setup, self._keeper, self._shown)))
+        for _ in range(min(room, wanted - len(self._members))):
+            self._members.append(_Member(actor=self._kind.remote(self._setup, self._keeper, self._shown)))
+        return self._members
 
-    def free(self, busy: Any) -> list[_Member]:
-        engaged = set(map(id, busy))
-        return [member for member in self.members if id(member) not in engaged]
+    def give(self, worker: _Member, work: SceneWork) -> None:
+        worker.said = worker.actor.run.options(num_returns="streaming").remote(work)
 
-    def bury(self, member: _Member) -> None:
-        self.members.remove(member)
+    def receive(self, busy: Collection[_Member]) -> Iterator[tuple[_Member, Message]]:
+        import ray
+        from ray.exceptions import RayActorError
+
+        by_stream = {worker.said: worker for worker in busy}
+        if not by_stream:  # no machine has room
+            time.sleep(LOOK_SECONDS)
+            return
+        ready, _ = ray.wait(list(by_stream), timeout=LOOK_SECONDS)
+        for stream in ready:
+            worker = by_stream[stream]
+            try:
+                message = ray.get(next(stream))
+            except StopIteration:
+                yield worker, Finished()
+            except RayActorError as error:
+                self._members.remove(worker)
+                yield worker, Died(str(error).splitlines()[0])
+            else:
+                yield worker, message
+
+    def close(self) -> None:
+        """Nothing: Ray ends the actors of a driver that leaves."""
 
 
 class _Actor:
@@ -140,12 +122,12 @@ class _Actor:
         self._shown = shown
         self._bench = Workbench(setup, cast(SampleStore, _DistantStore(keeper, setup.store)), self._demonstrations)
 
-    def run(self, work: SceneWork) -> Iterator[Outcome | Trouble]:
+    def run(self, work: SceneWork) -> Iterator[Outcome | WorkError]:
         """Each outcome of ``work`` as it comes, and the error that ended it early, if one did."""
         try:
             yield from self._bench.run(work)
         except Exception as error:
-            yield Trouble.of(error)
+            yield WorkError.of(error)
 
     def _demonstrations(self, task: str, count: int) -> list[Demonstration]:
         import ray

@@ -1,15 +1,12 @@
-"""``episodes.parquet``: one row an execution."""
+"""One row of the results: an execution."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from robust_instant_policy.evaluation.rows import RowFile
 from robust_instant_policy.evaluation.variant import Scene, Variant
 
-EPISODES_FILE = "episodes.parquet"
-
+Trial = tuple[Scene, Variant]  # one plan in one scene, with all its executions
 EpisodeKey = tuple[Scene, Variant, int]
 
 
@@ -36,15 +33,9 @@ class Episode:
     failure: str
 
     @property
+    def trial(self) -> Trial:
+        return self.scene, self.variant
+
+    @property
     def key(self) -> EpisodeKey:
         return self.scene, self.variant, self.candidate
-
-
-def holds_episodes(folder: Path) -> bool:
-    """Whether ``folder`` is that of an evaluation: it has the table, or the journal of one that has just begun."""
-    return any(folder.glob(Path(EPISODES_FILE).with_suffix(".*").name))
-
-
-def open_episodes(folder: Path) -> RowFile[Episode]:
-    """The rows of ``folder/episodes.parquet``."""
-    return RowFile(Episode, folder / EPISODES_FILE)

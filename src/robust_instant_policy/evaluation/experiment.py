@@ -5,18 +5,28 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robust_instant_policy.evaluation.episodes import Episode, open_episodes
-from robust_instant_policy.evaluation.failures import Failure, open_failures, video_file
-from robust_instant_policy.evaluation.scenes import count_demonstrations, demonstrations_folder, obtain_demonstrations
+from robust_instant_policy.demonstration import Demonstration
+from robust_instant_policy.evaluation.episodes import Episode, Trial
+from robust_instant_policy.evaluation.failures import Failure, video_file
+from robust_instant_policy.evaluation.manifest import code_digest
+from robust_instant_policy.evaluation.scenes import (
+    demonstration_digests,
+    demonstrations_folder,
+    obtain_demonstrations,
+    stored_demonstrations,
+)
+from robust_instant_policy.evaluation.store import ResultsStore
 from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.variant import Scene, Variant
-from robust_instant_policy.evaluation.work import Hands, Outcome, Planned, SceneWork, Setup
+from robust_instant_policy.evaluation.work import Outcome, Planned, SceneWork, Setup, Workers
 from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.files import lock_folder, make_folder, write_whole
+from robust_instant_policy.llm import model_name
+from robust_instant_policy.perception.network import resolve_features
 from robust_instant_policy.policies import IMAGE_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.tasks import make_task
@@ -26,46 +36,72 @@ if TYPE_CHECKING:  # it needs the extra "train"
 
 PLAN_FOLDER, TRAINING_FOLDER = "plans", "training"
 
-Plan = tuple[Scene, Variant]
+
+def ignore(*_: object) -> None:
+    """The callback of a caller who does not look."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Called as the run goes on: ``recording(task, there, wanted, thrown away)``, ``outcome(plans done, plans wanted,
-    what has just come, or None at the start)``, ``training`` while a method is trained, and ``trained(task, variant,
-    policy)`` when that is done.
+    """Called as the run goes on: ``recording(task, there, wanted, thrown away)``, ``outcome(trials done, trials wanted,
+    what has just come, or None at the start)``, ``training`` while a method is trained, ``trained(task, variant,
+    policy)`` when that is done, and ``note`` with a line that the user should read.
     """
 
-    recording: Callable[[str, int, int, int], None]
-    outcome: Callable[[int, int, Outcome | None], None]
+    recording: Callable[[str, int, int, int], None] = ignore
+    outcome: Callable[[int, int, Outcome | None], None] = ignore
     training: TrainingReport = no_report
-    trained: Callable[[str, Variant, TrainedPolicy], None] = lambda task, variant, policy: None
+    trained: Callable[[str, Variant, TrainedPolicy], None] = ignore
+    note: Callable[[str], None] = ignore
 
 
-def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, progress: Progress) -> None:
-    """Run what is missing of ``suites`` in ``out``: episodes, and the analysis of those that failed.
+def run_suites(
+    suites: Sequence[Suite],
+    setup: Setup,
+    out: Path,
+    workers: Workers,
+    progress: Progress = Progress(),
+    arguments: Sequence[str] = ("(called from Python)",),
+    keep: bool = False,
+) -> None:
+    """Run what is missing of ``suites`` in ``out``: executions, and the analysis of those that failed.
 
     Demonstrations are kept in ``setup.data/TASK`` and recorded where they are missing. What several suites ask for is
-    done once, and everything in one scene together, so that its samples are asked for once.
+    done once, and everything in one scene together, so that its samples are asked for once. Rows of another version of
+    the code are not counted as done unless ``keep``; rows with other demonstrations never are. ``arguments`` are the
+    words of the command, noted in the manifest.
     """
+    suites = [identified(suite, setup) for suite in suites]
     make_folder(out)
-    with one_writer(out), closing(open_episodes(out)) as episodes, closing(open_failures(out)) as failures:
-        wanted = wanted_plans(suites)
-        left = executions_left(episodes.rows)
-        done = sum(left.get(plan) == 0 for plan in wanted)
-        progress.outcome(done, len(wanted), None)
-        kept = wanted_plans(suite for suite in suites if suite.keeps_plans)
-        works = missing_work(wanted, kept, episodes.rows, failures.rows, out, setup.films)
+    with (
+        one_writer(out),
+        closing(ResultsStore(out)) as store,
+        store.invocation(suites, arguments, model_name(setup.llm)),
+    ):
+        episodes = store.results().episodes
+        trials = _with_demonstrations(wanted_trials(suites), episodes, setup, progress, keep)
+        left = executions_left(episodes)
+        if keep:
+            complete = {_of_any_code(trial) for trial, count in left.items() if count == 0}
+            trials = [trial for trial in trials if trial in left or _of_any_code(trial) not in complete]
+        if repeated := _superseded(trials, episodes):
+            progress.note(
+                f"{repeated} plans were executed with other code, demonstrations, features or deadline; these rows "
+                "stay apart, and the plans are executed again (--keep leaves out what only the code tells apart)"
+            )
+        done = sum(left.get(trial) == 0 for trial in trials)
+        progress.outcome(done, len(trials), None)
+        drawn = set(wanted_trials(suite for suite in suites if suite.keeps_plans))
+        kept = [trial for trial in trials if _of_any_demonstrations(trial) in drawn]
+        works = missing_work(trials, kept, episodes, store.results().failures, out, setup.films)
         if not works:
             return
-        _record_missing(works, setup, progress)
         _train_missing(works, setup, progress)
-        for outcome in hands(setup, works):
+        for outcome in workers(setup, works):
             if isinstance(outcome, Episode):
-                episodes.add(outcome)
-                plan = outcome.scene, outcome.variant
-                left[plan] = left.get(plan, outcome.candidates) - 1
-                done += left[plan] == 0
+                store.add(outcome)
+                left[outcome.trial] = left.get(outcome.trial, outcome.candidates) - 1
+                done += left[outcome.trial] == 0
             elif isinstance(outcome, Planned):
                 path = out / plan_file(outcome.scene, outcome.variant)
                 path.parent.mkdir(exist_ok=True)
@@ -74,8 +110,8 @@ def run_suites(suites: Sequence[Suite], setup: Setup, out: Path, hands: Hands, p
                 failure = outcome.failure
                 if outcome.video:
                     write_whole(out / video_file(failure.scene, failure.variant, failure.candidate), outcome.video)
-                failures.add(failure)
-            progress.outcome(done, len(wanted), outcome)
+                store.add(failure)
+            progress.outcome(done, len(trials), outcome)
 
 
 @contextmanager
@@ -88,7 +124,23 @@ def one_writer(out: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def wanted_plans(suites: Iterable[Suite]) -> list[Plan]:
+def identified(suite: Suite, setup: Setup) -> Suite:
+    """``suite`` with all that decides its rows but the demonstrations: network, code, deadline."""
+    return replace(
+        suite,
+        variants=tuple(
+            replace(
+                variant,
+                features=resolve_features(variant.features),
+                code=code_digest(),
+                deadline_s=setup.deadline_s,
+            )
+            for variant in suite.variants
+        ),
+    )
+
+
+def wanted_trials(suites: Iterable[Suite]) -> list[Trial]:
     """Every plan that ``suites`` ask for, once, those of one scene together."""
     by_scene: dict[Scene, dict[Variant, None]] = {}
     for suite in suites:
@@ -97,12 +149,11 @@ def wanted_plans(suites: Iterable[Suite]) -> list[Plan]:
     return [(scene, variant) for scene, variants in by_scene.items() for variant in variants]
 
 
-def executions_left(rows: Iterable[Episode]) -> dict[Plan, int]:
+def executions_left(rows: Iterable[Episode]) -> dict[Trial, int]:
     """How many executions the plans that were begun still lack."""
-    left: dict[Plan, int] = {}
+    left: dict[Trial, int] = {}
     for row in rows:
-        plan = row.scene, row.variant
-        left[plan] = left.get(plan, row.candidates) - 1
+        left[row.trial] = left.get(row.trial, row.candidates) - 1
     return left
 
 
@@ -117,8 +168,8 @@ def training_file(task: str, variant: Variant) -> str:
 
 
 def missing_work(
-    wanted: Sequence[Plan],
-    kept: Sequence[Plan],
+    wanted: Sequence[Trial],
+    kept: Sequence[Trial],
     rows: Sequence[Episode],
     failures: Sequence[Failure],
     out: Path,
@@ -135,7 +186,7 @@ def missing_work(
     done: dict[Scene, set] = {scene: set() for scene in variants}
     failed: dict[Scene, list[Episode]] = {scene: [] for scene in variants}
     for row in rows:
-        if (row.scene, row.variant) in among:
+        if row.trial in among:
             done[row.scene].add(row.key)
             filmed = not films or row.executed_seconds == 0 or (out / video_file(*row.key)).exists()
             if not row.success and not (row.key in examined and filmed):
@@ -151,26 +202,72 @@ def missing_work(
     ]
 
 
-def _record_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:
-    assets = works[0].scene.assets
+def _of_any_code(trial: Trial) -> Trial:
+    scene, variant = trial
+    return scene, replace(variant, code="")
+
+
+def _of_any_demonstrations(trial: Trial) -> Trial:
+    scene, variant = trial
+    return scene, replace(variant, demonstrations="")
+
+
+def _superseded(trials: Sequence[Trial], rows: Sequence[Episode]) -> int:
+    """How many of ``trials`` have no executions of their own, but some that differ only in what nobody chose."""
+
+    def chosen(trial: Trial) -> Trial:
+        scene, variant = trial
+        return scene, replace(variant, code="", demonstrations="", features="", deadline_s=None)
+
+    own = {row.trial for row in rows}
+    begun = {chosen(trial) for trial in own}
+    return sum(trial not in own and chosen(trial) in begun for trial in trials)
+
+
+def _with_demonstrations(
+    trials: Sequence[Trial], rows: Sequence[Episode], setup: Setup, progress: Progress, keep: bool
+) -> list[Trial]:
+    """``trials`` with the digest of the demonstrations that they are shown, which are recorded where they are missing.
+
+    Where a task's demonstrations are not at hand, and nothing that is wanted of it lacks executions, those that the
+    rows tell of are taken.
+    """
+
+    def plain(trial: Trial) -> Trial:
+        return _of_any_demonstrations(_of_any_code(trial) if keep else trial)
+
+    done = {plain(trial): trial[1].demonstrations for trial, left in executions_left(rows).items() if left == 0}
     most: dict[tuple[str, bool], int] = {}
-    for work in works:
-        needs = {(work.scene.task, False): work.demos}
-        for variant in work.concerned:
-            if variant.method in IMAGE_METHODS:
-                needs[work.scene.task, True] = max(needs.get((work.scene.task, True), 0), variant.demos)
-        most |= {key: max(count, most.get(key, 0)) for key, count in needs.items()}
-    for (name, with_images), count in most.items():
-        folder = demonstrations_folder(setup.data, name, with_images)
-        if count_demonstrations(folder, name) >= count:
-            continue
-        task = make_task(name, assets=assets)
-        try:
-            obtain_demonstrations(
-                task, folder, count, lambda *so_far, name=name: progress.recording(name, *so_far), with_images
-            )
-        finally:
-            task.close()
+    for scene, variant in trials:
+        for with_images in {False, variant.method in IMAGE_METHODS}:
+            most[scene.task, with_images] = max(variant.demos, most.get((scene.task, with_images), 0))
+    digests: dict[tuple[str, bool], list[str]] = {}
+    for (task, with_images), count in most.items():
+        folder = demonstrations_folder(setup.data, task, with_images)
+        shown = stored_demonstrations(folder, task, count)
+        of_task = [trial for trial in trials if trial[0].task == task]
+        if len(shown) < count and not all(plain(trial) in done for trial in of_task):
+            shown = _record(task, of_task[0][0].assets, folder, count, with_images, progress)
+        digests[task, with_images] = demonstration_digests(shown)
+
+    def digest(trial: Trial) -> str:
+        scene, variant = trial
+        known = digests[scene.task, variant.method in IMAGE_METHODS]
+        return known[variant.demos] if variant.demos < len(known) else done[plain(trial)]
+
+    return [(trial[0], replace(trial[1], demonstrations=digest(trial))) for trial in trials]
+
+
+def _record(
+    name: str, assets: str, folder: Path, count: int, with_images: bool, progress: Progress
+) -> list[Demonstration]:
+    task = make_task(name, assets=assets)
+    try:
+        return obtain_demonstrations(
+            task, folder, count, lambda *so_far: progress.recording(name, *so_far), with_images
+        )
+    finally:
+        task.close()
 
 
 def _train_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:

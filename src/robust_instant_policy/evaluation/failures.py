@@ -1,44 +1,42 @@
-"""``failures.parquet``: which stage lost a failed episode, found by replacing stages with the truth one by one.
+"""Failure analysis: which stage a failed episode failed in, found by replacing stages with the truth one by one.
 
-The robot, the keypoints, the samples and the regression are asked in this order, and the first that is to blame is:
+Execution, keypoints, regression and samples are checked in this order, and the failure is counted for the first that
+it is due to:
 
-- *execution*: the demonstrator's own trajectory for the scene, thinned out and played back like a plan, fails too;
+- *execution*: the demonstrator's own trajectory for the scene, downsampled and executed like a plan, fails too;
 - *keypoints*: with the true keypoints in place of those that perception found, the same method succeeds;
-- *regression*: one of the very candidates that were aggregated succeeds by itself;
-- *samples*: none of them does, or the candidate that failed is a sample taken at its word.
+- *regression*: one of the candidates that were aggregated succeeds by itself;
+- *samples*: none of them does, or the trajectory that failed is a single sample, not aggregated.
 
-A policy in closed loop has no such stages; beyond the execution, its failures are its own (*policy*).
+A closed-loop policy has no such stages; beyond the execution, its failures are its own (*policy*).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from robust_instant_policy.datasets.video import FILM_OPTIONS, VideoEncoder
-from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError, PlanningError
 from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey
-from robust_instant_policy.evaluation.rollout import execute
-from robust_instant_policy.evaluation.rows import RowFile
+from robust_instant_policy.evaluation.rollout import ScenePolicy, execute
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.perception import Located
 from robust_instant_policy.perception.accuracy import KnownScene, measure
-from robust_instant_policy.policies import ClosedLoopPolicy, KeypointContext, Policy
+from robust_instant_policy.policies import ClosedLoopPolicy, Context, LocatedScene, Stage
 from robust_instant_policy.tasks.task import FrameSink, Task
 from robust_instant_policy.trajectory import Trajectory, downsample
 
-FAILURES_FILE = "failures.parquet"
 VIDEO_FOLDER = "videos"
 STAGES = ("keypoints", "samples", "regression", "execution", "policy")
 
 
 @dataclass(frozen=True)
 class Failure:
-    """The ``stage`` to which a failed episode is laid, and what was found on the way; None where nobody looked.
+    """The ``stage`` that a failed episode is due to, and what was found on the way; None where it was not checked.
 
     ``demonstrator`` says whether the demonstrator's trajectory succeeds when played back, ``true_keypoints`` whether
     the method succeeds with the true keypoints, ``good_candidate`` whether one of the candidates that were aggregated
@@ -59,11 +57,6 @@ class Failure:
         return self.scene, self.variant, self.candidate
 
 
-def open_failures(folder: Path) -> RowFile[Failure]:
-    """The rows of ``folder/failures.parquet``."""
-    return RowFile(Failure, folder / FAILURES_FILE)
-
-
 def video_file(scene: Scene, variant: Variant, candidate: int) -> str:
     """Where, in a run's folder, the video of an episode is kept."""
     return f"{VIDEO_FOLDER}/{scene}-{variant.file_name}-{candidate}.mp4"
@@ -80,15 +73,13 @@ class Truth:
     error: float
 
 
-def true_keypoints(
-    task: Task, seed: int, context: KeypointContext, shown: Sequence[Demonstration], shown_truth: Sequence[KnownScene]
-) -> Truth | None:
-    """Where the keypoints of ``context``, fitted to ``shown``, are in the scene of ``seed``; None where it cannot say.
+def true_keypoints(task: Task, seed: int, context: Context, shown_truth: Sequence[KnownScene]) -> Truth | None:
+    """Where the keypoints of ``context`` are in the scene of ``seed``; None where it cannot say.
 
     ``shown_truth`` is the simulator's knowledge of the demonstrations' own scenes.
     """
     observation = task.reset(seed)
-    images = [demonstration.observation for demonstration in shown]
+    images = [demonstration.observation for demonstration in context.demonstrations]
     try:
         accuracy = measure(context.extractor, images, shown_truth, [observation], [task.scene_truth()])
     except KeypointError:
@@ -100,8 +91,8 @@ def true_keypoints(
     return Truth(replace(found, keypoints=known), float(np.nanmax(accuracy.errors)))
 
 
-class Inquest:
-    """Takes the failed episodes of one scene apart; what several of them need is tried only once."""
+class FailureAnalysis:
+    """Analyses the failed episodes of one scene; what several of them need is tried only once."""
 
     def __init__(self, task: Task, scene: Scene):
         self._task, self._scene = task, scene
@@ -110,15 +101,13 @@ class Inquest:
     def examine(
         self,
         episode: Episode,
-        policy: Policy | ClosedLoopPolicy,
+        policy: ScenePolicy | ClosedLoopPolicy,
         observation: Observation,
-        context: KeypointContext,
         truth: Callable[[], Truth | None],
     ) -> Failure:
-        """Lay ``episode``, in which ``policy`` failed from ``observation``, at one stage's door.
+        """Find the stage to which the failure of ``policy`` from ``observation`` in ``episode`` is due.
 
-        ``context`` is what the policy knows of keypoints. Raises `ModelError` where samples are missing that the
-        method would need with the true keypoints.
+        Raises `ModelError` where samples are missing that the method would need with the true keypoints.
         """
         found = Failure(episode.scene, episode.variant, episode.candidate, "policy", True, None, None, None)
         if not self._demonstrator_succeeds(episode.variant.downsampling):
@@ -129,7 +118,7 @@ class Inquest:
         if known is None:
             return replace(found, stage="keypoints")
         self._task.reset(self._scene.seed)
-        better = self._succeeds_with(known.located, policy, observation, context, episode.candidate)
+        better = self._succeeds_with(known.located, policy, episode.candidate)
         found = replace(found, true_keypoints=better, keypoint_error=known.error)
         if better:
             return replace(found, stage="keypoints")
@@ -149,13 +138,9 @@ class Inquest:
             self._replayed[downsampling] = self._plays(downsample(shown, downsampling))
         return self._replayed[downsampling]
 
-    def _succeeds_with(
-        self, located: Located, policy: Policy, observation: Observation, context: KeypointContext, candidate: int
-    ) -> bool:
-        same = replace(observation)  # the same scene, as another object: what was planned before does not count
-        context.assume(same, located)
+    def _succeeds_with(self, located: Located, policy: ScenePolicy, candidate: int) -> bool:
         try:
-            trajectories = policy.executions(policy.plan(same))
+            trajectories = policy.executions(policy.plan_scene(LocatedScene(located, Stage("keypoints", 0.0))))
         except PlanningError:
             return False
         return self._plays(trajectories[min(candidate, len(trajectories) - 1)])
@@ -164,7 +149,7 @@ class Inquest:
         return execute(self._task, trajectory).success
 
 
-def film(task: Task, policy: Policy | ClosedLoopPolicy, observation: Observation, candidate: int) -> bytes:
+def film(task: Task, policy: ScenePolicy | ClosedLoopPolicy, observation: Observation, candidate: int) -> bytes:
     """The episode once more, in the task's scene, as an MP4; empty where nothing moved."""
     encoder = VideoEncoder(task.video_hz, FILM_OPTIONS)
     sink: FrameSink = encoder.add

@@ -1,27 +1,27 @@
-"""``run.json``: which suites a folder holds, by which commands, where and for how long they were run. No secrets."""
+"""Which suites a run's folder holds, and by which commands, with which code and where it was made. No secrets."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
-import shlex
 import subprocess
-import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.suites import Suite
-from robust_instant_policy.evaluation.variant import Variant
 from robust_instant_policy.files import write_whole
 
 MANIFEST_FILE = "run.json"
 GIB = 2**30
+PACKAGE = Path(__file__).parents[1]
+# What is in these rooms and files shows, serves or stores; everything else in the package decides results.
+NOT_DECIDING = ("commands", "reporting", "serving", "robots", "evaluation", "cli.py", "errors.py", "files.py")
+DECIDING = ("evaluation/rollout.py", "evaluation/workbench.py")
 
 
 @dataclass(frozen=True)
@@ -38,75 +38,44 @@ class Invocation:
 
 @dataclass(frozen=True)
 class Manifest:
-    """All that ``run.json`` says: suites of one name and the same objects are one, invocations are oldest first."""
+    """Suites, of which those of one name and the same objects are one, and the commands, oldest first."""
 
     suites: tuple[Suite, ...] = ()
     invocations: tuple[Invocation, ...] = ()
 
     @classmethod
-    def read(cls, folder: Path) -> Manifest:
-        """Of ``folder``; empty where nothing was run. Raises `DatasetError` for a damaged file."""
-        path = folder / MANIFEST_FILE
+    def read(cls, path: Path) -> Manifest:
+        """Of a ``run.json``; empty where there is none. Raises `DatasetError` for a damaged file."""
         if not path.exists():
             return cls()
         try:
-            content = json.loads(path.read_text())
+            content = json.loads(path.read_text(encoding="utf-8"))
             return cls(
-                tuple(_suite(one) for one in content["suites"]),
+                tuple(Suite.from_json(one) for one in content["suites"]),
                 tuple(Invocation(**one) for one in content["invocations"]),
             )
         except (KeyError, ValueError, TypeError) as error:
             raise DatasetError(f"{path} is damaged ({error}); move it away and run the same command again") from None
 
-    def write(self, folder: Path) -> None:
+    def write(self, path: Path) -> None:
         text = json.dumps(asdict(self), indent=1) + "\n"  # an infinite ν is written as Infinity, as Python reads it
-        write_whole(folder / MANIFEST_FILE, text.encode())
-
-    def with_suites(self, suites: Iterable[Suite]) -> Manifest:
-        known = {(suite.name, suite.objects, suite.assets): suite for suite in self.suites}
-        for suite in suites:
-            key = suite.name, suite.objects, suite.assets
-            known[key] = known[key].merged(suite) if key in known else suite
-        return replace(self, suites=tuple(known.values()))
-
-    def joined(self, other: Manifest) -> Manifest:
-        """What both of them say, each command once."""
-        commands = dict.fromkeys((*self.invocations, *other.invocations))
-        return replace(
-            self.with_suites(other.suites), invocations=tuple(sorted(commands, key=lambda command: command.began))
-        )
+        write_whole(path, text.encode())
 
 
-def _suite(content: dict) -> Suite:
-    variants = tuple(Variant(**one) for one in content["variants"])
-    return Suite(
-        content["name"],
-        tuple(content["tasks"]),
-        variants,
-        tuple(content["seeds"]),
-        content["objects"],
-        content.get("assets", "code"),
-    )
+@cache
+def code_digest(package: Path = PACKAGE) -> str:
+    """Short digest of the files of ``package`` that decide results: equal code gives equal rows.
 
-
-@contextmanager
-def invocation(folder: Path, suites: Sequence[Suite], arguments: Sequence[str], model: str) -> Iterator[None]:
-    """Note in ``folder/run.json`` what is done meanwhile, whether it ends well or is stopped."""
-    manifest = Manifest.read(folder).with_suites(suites)
-    manifest.write(folder)
-    began, start = datetime.now(UTC), time.monotonic()
-    try:
-        yield
-    finally:
-        now = Invocation(
-            command=shlex.join(arguments),
-            began=began.isoformat(timespec="seconds"),
-            hours=round((time.monotonic() - start) / 3600, 4),
-            machine=machine(),
-            code=code(),
-            model=model,
-        )
-        replace(manifest, invocations=(*manifest.invocations, now)).write(folder)
+    A commit that changes documents, pages or commands only does not change it.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*")):
+        name = path.relative_to(package).as_posix()
+        if path.suffix not in (".py", ".urdf"):
+            continue
+        if name.split("/")[0] not in NOT_DECIDING or name in DECIDING:
+            digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:12]
 
 
 def machine() -> str:
@@ -115,15 +84,14 @@ def machine() -> str:
     return f"{os.cpu_count()} cores ({_processor()}), {memory:.0f} GiB, {platform.system()} {platform.release()}"
 
 
-def code() -> str:
+def code_version() -> str:
     """Version of the package, with the commit where it runs from a checkout."""
     try:
         name = version("robust-instant-policy")
     except PackageNotFoundError:
         name = "unknown version"
-    here = Path(__file__).parent
     found = subprocess.run(
-        ["git", "-C", str(here), "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=False
+        ["git", "-C", str(PACKAGE), "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=False
     )
     return f"{name} ({found.stdout.strip()})" if found.returncode == 0 else name
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robust_instant_policy.errors import DatasetError, UsageError
-from robust_instant_policy.evaluation.episodes import Episode, open_episodes
 from robust_instant_policy.evaluation.experiment import PLAN_FOLDER, TRAINING_FOLDER, one_writer
-from robust_instant_policy.evaluation.failures import Failure, open_failures, video_file
-from robust_instant_policy.evaluation.manifest import Manifest
+from robust_instant_policy.evaluation.failures import video_file
+from robust_instant_policy.evaluation.store import Results, ResultsStore, read_results
 from robust_instant_policy.evaluation.work import STORE_FILE
 from robust_instant_policy.files import finished_files, make_folder, write_whole
 from robust_instant_policy.llm import SampleStore
@@ -36,49 +35,39 @@ def merge(folders: Sequence[Path], out: Path, report: Callable[[Share], None] = 
     """
     if out.resolve() in [folder.resolve() for folder in folders]:
         raise UsageError(f"{out} is itself one of the runs; leave it out of them, or give a new folder")
-    runs = [_Run.read(folder) for folder in folders]
+    runs = [(folder, _read(folder)) for folder in folders]
     make_folder(out)
     shares = []
-    with one_writer(out), closing(open_episodes(out)) as episodes, closing(open_failures(out)) as failures:
-        for run in runs:
-            before = len(episodes.rows)
-            known = {row.key: row for row in episodes.rows}
+    with one_writer(out), closing(ResultsStore(out)) as store:
+        for folder, run in runs:
+            known = {row.key: row for row in store.results().episodes}
             # of an execution that out has from elsewhere, nothing is taken
             own = {row.key for row in run.episodes if known.get(row.key, row) == row}
-            for failure in run.failures:
-                if failure.key in own:
-                    failures.add(failure)
-            for name in (*run.pictures(), *(video_file(*key) for key in own)):
-                if (run.folder / name).exists() and not (out / name).exists():
-                    write_whole(out / name, (run.folder / name).read_bytes())
-            if (run.folder / STORE_FILE).exists():
-                with closing(SampleStore(out / STORE_FILE)) as store:
-                    store.take(run.folder / STORE_FILE)
-            for episode in run.episodes:  # last: a row says that all that belongs to it is there
-                episodes.add(episode)
-            Manifest.read(out).joined(run.manifest).write(out)
-            new = len(episodes.rows) - before
-            shares.append(Share(run.folder, new, len(run.episodes) - new))
+            for name in (*_pictures(folder), *(video_file(*key) for key in own)):
+                if (folder / name).exists() and not (out / name).exists():
+                    write_whole(out / name, (folder / name).read_bytes())
+            if (folder / STORE_FILE).exists():
+                with closing(SampleStore(out / STORE_FILE)) as samples:
+                    samples.take(folder / STORE_FILE)
+            store.note(run.manifest)
+            # last: a row says that all that belongs to it is there
+            store.add(*(failure for failure in run.failures if failure.key in own), *run.episodes)
+            new = len({row.key for row in run.episodes} - known.keys())
+            shares.append(Share(folder, new, len(run.episodes) - new))
             report(shares[-1])
+        store.export()
     return shares
 
 
-@dataclass(frozen=True, eq=False)
-class _Run:
-    folder: Path
-    manifest: Manifest
-    episodes: Sequence[Episode]
-    failures: Sequence[Failure]
+def _read(folder: Path) -> Results:
+    results = read_results(folder)
+    if not results.episodes:
+        raise DatasetError(f"{folder} holds no executions; give folders that rip eval --out wrote")
+    return results
 
-    @classmethod
-    def read(cls, folder: Path) -> _Run:
-        episodes = open_episodes(folder).rows
-        if not episodes:
-            raise DatasetError(f"{folder} holds no executions; give folders that rip eval --out wrote")
-        return cls(folder, Manifest.read(folder), episodes, open_failures(folder).rows)
 
-    def pictures(self) -> Iterator[str]:
-        """Files of plans and trainings, from the folder on."""
-        for name in (PLAN_FOLDER, TRAINING_FOLDER):
-            for path in sorted(finished_files(self.folder / name)):
-                yield str(path.relative_to(self.folder))
+def _pictures(folder: Path) -> Iterator[str]:
+    """Files of plans and trainings, from the folder on."""
+    for name in (PLAN_FOLDER, TRAINING_FOLDER):
+        for path in sorted(finished_files(folder / name)):
+            yield str(path.relative_to(folder))

@@ -1,106 +1,48 @@
-"""Workers on this machine: processes of their own, so that nothing that happens to one of them ends the run."""
+"""Workers on this machine: processes of their own, so that nothing that happens to one of them ends the run.
+
+A local Ray takes 10 s to start, processes 0.3 s: hence two kinds of pools.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from robust_instant_policy.evaluation.work import Agenda, Outcome, SceneWork, Setup, Trouble
+from robust_instant_policy.evaluation.work import Outcome, SceneWork, Setup
 from robust_instant_policy.evaluation.workbench import Workbench
+from robust_instant_policy.evaluation.workers import ONE_THREAD, Died, Finished, Message, Worker, WorkError, run_pool
 
-# Sums depend in their last bits on the number of threads that share them, and prompts on every bit: one thread a
-# worker gives the same rows whatever the machine. It is faster, too; --workers is the way to use more cores.
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-POLITE_SECONDS = 5.0  # that a worker gets to end by itself
+EXIT_SECONDS = 5.0  # that a worker gets to end by itself
+PR_SET_PDEATHSIG = 1  # of Linux's prctl
 
 
 @dataclass(frozen=True)
-class Processes:
+class LocalWorkers:
     """``count`` worker processes."""
 
     count: int
 
     def __call__(self, setup: Setup, works: list[SceneWork]) -> Iterator[Outcome]:
-        """Do ``works``. A worker that dies loses the execution under way and is replaced; others go on.
-
-        Raises `RipError` with the words of an error that a worker met.
-        """
-        agenda = Agenda(works)
-        team = [_Worker(setup) for _ in range(min(self.count, len(works)))]
-        try:
-            while True:
-                for worker in team:
-                    if worker.work is None:
-                        others = [other.task for other in team if other is not worker]
-                        worker.give(agenda.next(worker.task, others))
-                at_work = {worker.pipe: worker for worker in team if worker.work is not None}
-                if not at_work:
-                    return
-                for pipe in wait(list(at_work)):
-                    worker = at_work[pipe]  # type: ignore[index]
-                    try:
-                        outcome = worker.receive()
-                    except (EOFError, OSError):
-                        agenda.put_back(worker.left(), worker.cause_of_death())
-                        team[team.index(worker)] = _Worker(setup)
-                        continue
-                    if outcome is not None:
-                        yield outcome
-        finally:
-            for worker in team:
-                worker.end()
+        return run_pool(_Processes(setup, self.count), works)
 
 
-@dataclass
-class _Worker:
-    """A process, the scene it was given and what it has said of it."""
-
-    setup: Setup
-    work: SceneWork | None = None
-    task: str = ""
-    outcomes: list[Outcome] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe: Connection[Any, Any]
-        self.pipe, theirs = context.Pipe()
-        self.process: BaseProcess = context.Process(target=_serve, args=(theirs, self.setup), daemon=True)
-        with one_thread_each():
-            self.process.start()
-        theirs.close()
-
-    def give(self, work: SceneWork | None) -> None:
-        if work is not None:
-            self.work, self.task, self.outcomes = work, work.scene.task, []
-            with suppress(OSError):  # a process that died in the meantime is found out on receiving
-                self.pipe.send(work)
-
-    def receive(self) -> Outcome | None:
-        """The next outcome, or None once the scene is done; `EOFError` when the process is no more."""
-        said = self.pipe.recv()
-        if said is None:
-            self.work = None
-            return None
-        if isinstance(said, Trouble):
-            raise said.as_error()
-        self.outcomes.append(said)
-        return said
-
-    def left(self) -> SceneWork:
-        """What a process that died has not done."""
-        assert self.work is not None
-        return self.work.without(self.outcomes)
+@dataclass(eq=False, kw_only=True)
+class _Process(Worker):
+    process: BaseProcess
+    pipe: Connection[Any, Any]
 
     def cause_of_death(self) -> str:
-        self.process.join(POLITE_SECONDS)
+        self.process.join(EXIT_SECONDS)
         code = self.process.exitcode
         return f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit status {code}"
 
@@ -108,10 +50,51 @@ class _Worker:
         self.pipe.close()
         if self.work is not None:
             self.process.terminate()
-        self.process.join(POLITE_SECONDS)
+        self.process.join(EXIT_SECONDS)
         if self.process.is_alive():
             self.process.kill()
             self.process.join()
+
+
+@dataclass
+class _Processes:
+    """A `Pool` of up to ``most`` processes."""
+
+    setup: Setup
+    most: int
+    alive: list[_Process] = field(default_factory=list)
+
+    def workers(self, wanted: int) -> list[_Process]:
+        while len(self.alive) < min(self.most, wanted):
+            self.alive.append(self._start())
+        return self.alive
+
+    def give(self, worker: _Process, work: SceneWork) -> None:
+        with suppress(OSError):
+            worker.pipe.send(work)
+
+    def receive(self, busy: Collection[_Process]) -> Iterator[tuple[_Process, Message]]:
+        pipes = {worker.pipe: worker for worker in busy}
+        for pipe in wait(list(pipes)):
+            worker = pipes[pipe]  # type: ignore[index]
+            try:
+                yield worker, worker.pipe.recv()
+            except (EOFError, OSError):
+                self.alive.remove(worker)
+                yield worker, Died(worker.cause_of_death())
+
+    def close(self) -> None:
+        for worker in self.alive:
+            worker.end()
+
+    def _start(self) -> _Process:
+        context = multiprocessing.get_context("spawn")
+        pipe, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs, self.setup), daemon=True)
+        with one_thread_each():
+            process.start()
+        theirs.close()
+        return _Process(process=process, pipe=pipe)
 
 
 @contextmanager
@@ -130,12 +113,18 @@ def one_thread_each() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """Have this process end at once when the one that started it is no more, killed or not.
+    """Have this process end at once when the one that started it is no more, whatever this one is doing.
 
-    It would find out only with its next row, and plan on for minutes until then.
+    It would find out only with its next row, and plan on for minutes until then. On Linux the kernel sees to it, also
+    where a library holds the interpreter's lock; elsewhere a thread does.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent.pid:  # it was killed before the kernel was told
+            os._exit(1)
+        return
 
     def watch() -> None:
         wait([parent.sentinel])
@@ -154,10 +143,10 @@ def _serve(pipe: Connection, setup: Setup) -> None:
             work = pipe.recv()
             for outcome in bench.run(work):
                 pipe.send(outcome)
-            pipe.send(None)
+            pipe.send(Finished())
     except (EOFError, BrokenPipeError):
         pass
     except Exception as error:
-        pipe.send(Trouble.of(error))
+        pipe.send(WorkError.of(error))
     finally:
         bench.close()

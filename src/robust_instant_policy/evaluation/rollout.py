@@ -1,10 +1,11 @@
-"""One plan in one scene, executed; or one closed-loop policy let loose in it."""
+"""Execute one plan in one scene, or run one closed-loop policy in it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Collection, Iterator
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +16,24 @@ from robust_instant_policy.errors import KeypointError, PlanningError, Unreachab
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.policies import ClosedLoopPolicy, Policy
+from robust_instant_policy.policies import ClosedLoopPolicy, LocatedScene, Plan
 from robust_instant_policy.tasks.task import Execution, FrameSink, Task
 from robust_instant_policy.trajectory import Trajectory
 
 
+class ScenePolicy(Protocol):
+    """A fitted policy, to which also other keypoints can be given than perception finds."""
+
+    def plan(self, observation: Observation) -> Plan: ...
+
+    def plan_scene(self, scene: LocatedScene) -> Plan: ...
+
+    def executions(self, plan: Plan) -> tuple[Trajectory, ...]: ...
+
+
 def roll_out(
     task: Task,
-    policy: Policy | ClosedLoopPolicy,
+    policy: ScenePolicy | ClosedLoopPolicy,
     observation: Observation,
     scene: Scene,
     variant: Variant,
@@ -30,9 +41,8 @@ def roll_out(
 ) -> Iterator[Episode]:
     """Plan from ``observation``, of the task's last reset, and execute what the policy wants executed.
 
-    Every execution starts from a fresh build of the scene; those numbered in ``done`` are left out. Methods that share
-    an instant policy share its samples if they are given the same observation object. A plan that cannot be made, or
-    that the arm refuses, is a failed episode, not an error.
+    Every execution starts from a fresh build of the scene; those numbered in ``done`` are left out. A plan that cannot
+    be made, or that the arm refuses, is a failed episode, not an error.
     """
     row = partial(Episode, scene=scene, variant=variant)
     if isinstance(policy, ClosedLoopPolicy):
@@ -99,7 +109,7 @@ def _follow(task: Task, policy: ClosedLoopPolicy, observation: Observation, row:
 
 
 class _Timed:
-    """A controller, and the wall ``seconds`` it has thought so far."""
+    """A controller that measures its own wall time, ``seconds``."""
 
     def __init__(self, controller: Controller):
         self._controller = controller

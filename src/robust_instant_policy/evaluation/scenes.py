@@ -1,24 +1,28 @@
-"""Which scenes are drawn, for showing and for testing."""
+"""Which scenes are drawn, for showing and for testing, and which demonstrations are shown."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Iterable
 from pathlib import Path
+
+import numpy as np
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import NoDemonstrationsError
 from robust_instant_policy.tasks.record import record
-from robust_instant_policy.tasks.task import Task
+from robust_instant_policy.tasks.task import Task, bounded_seed
 
 FIRST_TEST_SEED = 100_000  # demonstrations draw scenes from 0 on, tests from here on
+SEED_BITS = 62  # of a scene's seed, which stands in tables of 64-bit integers
 SEEDS_A_RUN = 1_000  # apart, so that runs with different --seed share no scene
 IMAGES_HZ = 11.0  # about the rate at which demonstrations with images are recorded; rendering them takes long
 
 
 def scene_seed(seed: int, index: int) -> int:
     """Seed of the ``index``-th test scene of a run with ``--seed seed``."""
-    return FIRST_TEST_SEED + seed * SEEDS_A_RUN + index
+    return bounded_seed(FIRST_TEST_SEED + seed * SEEDS_A_RUN + index, SEED_BITS)
 
 
 def demonstrations_folder(data: Path, task: str, with_images: bool) -> Path:
@@ -26,12 +30,12 @@ def demonstrations_folder(data: Path, task: str, with_images: bool) -> Path:
     return data / (f"{task}-images" if with_images else task)
 
 
-def count_demonstrations(folder: Path, task: str) -> int:
-    """How many demonstrations of ``task`` are in ``folder``; 0 where there is nothing."""
+def stored_demonstrations(folder: Path, task: str, count: int) -> list[Demonstration]:
+    """The first ``count`` demonstrations of ``task`` in ``folder``, or as many as there are."""
     try:
-        return len(load_demonstrations(folder, task=task))
+        return load_demonstrations(folder, task=task, limit=count)
     except NoDemonstrationsError:
-        return 0
+        return []
 
 
 def obtain_demonstrations(
@@ -46,9 +50,25 @@ def obtain_demonstrations(
     Those ``with_images`` along the way are recorded at about `IMAGES_HZ`. ``on_progress`` receives (episodes there,
     episodes wanted, attempts thrown away).
     """
-    if count_demonstrations(folder, task.name) < count:
-        every = max(1, round(task.record_hz / IMAGES_HZ)) if with_images else 1
-        rate_hz = task.record_hz / every
-        with DatasetWriter(folder, task=task.name, description=task.description, rate_hz=rate_hz) as writer:
-            record(task, writer, count, with_images=with_images, every=every, on_progress=on_progress)
+    shown = stored_demonstrations(folder, task.name, count)
+    if len(shown) == count:
+        return shown
+    every = max(1, round(task.record_hz / IMAGES_HZ)) if with_images else 1
+    rate_hz = task.record_hz / every
+    with DatasetWriter(folder, task=task.name, description=task.description, rate_hz=rate_hz) as writer:
+        record(task, writer, count, with_images=with_images, every=every, on_progress=on_progress)
     return load_demonstrations(folder, task=task.name, limit=count)
+
+
+def demonstration_digests(demonstrations: Iterable[Demonstration]) -> list[str]:
+    """Short digests of the first 0, 1, 2, … demonstrations: of every number that a method may read from them."""
+    digest = hashlib.sha256()
+    digests = [""]
+    for demonstration in demonstrations:
+        seen, trajectory = demonstration.observation, demonstration.trajectory
+        arrays = (seen.rgb, seen.depth, seen.intrinsics, seen.camera_pose, trajectory.actions, trajectory.times)
+        frames = demonstration.frames() if demonstration.frames is not None else ()
+        for array in (*arrays, np.array(demonstration.rate_hz), *frames):
+            digest.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+        digests.append(digest.hexdigest()[:12])
+    return digests

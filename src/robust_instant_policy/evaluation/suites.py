@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.evaluation.scenes import scene_seed
@@ -46,6 +47,13 @@ class Suite:
             for name in names:
                 if name not in known:
                     raise UnknownNameError(kind, name, known)
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> Suite:
+        """Of its fields, as `dataclasses.asdict` gives them; a field that came later has its default."""
+        variants = tuple(Variant(**one) for one in content["variants"])
+        sequences = {name: tuple(content[name]) for name in ("tasks", "seeds")}
+        return cls(**{**content, **sequences, "variants": variants})
 
     @property
     def scenes(self) -> list[Scene]:

@@ -7,8 +7,9 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
-from robust_instant_policy.policies import ASKING_METHODS, DOF, REGRESSING_METHODS, TRAINED_METHODS
+from robust_instant_policy.policies import ASKING_METHODS, REGRESSING_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import DEFAULT_STEPS
+from robust_instant_policy.regression import DEFAULT_DOF
 
 
 @dataclass(frozen=True)
@@ -16,21 +17,26 @@ class Variant:
     """A method with every setting that its plans depend on, beside demonstrations and scene.
 
     ``demos`` demonstrations are shown; ``queries`` is the paper's Q, ``dof`` its ν; ``downsampling``, ``frames``,
-    ``layout`` and ``features`` are those of `InstantPolicy`; ``model`` names the language model; ``steps`` is how long
-    a method is trained. What a method does not use is always empty (``dof`` and ``steps`` None), so that the same work
-    is never done, nor counted, under two names; RIP with ν = ∞ is "rip-gauss".
+    ``layout`` and ``features`` are those of `Settings`; ``model`` names the language model; ``steps`` is how long
+    a method is trained; ``deadline_s`` bounds the sampling for one plan; ``code`` is the `code_digest` of the package,
+    which stands for every setting that has no name here; ``demonstrations`` the digest of those that were shown. What
+    a method does not use is always empty (a number None), so that the same work is never done, nor counted, under two
+    names; RIP with ν = ∞ is "rip-gauss". Rows of versions that did not note a setting have it empty, too: unknown.
     """
 
     method: str
     demos: int = 10
     queries: int = 5
-    dof: float | None = DOF
+    dof: float | None = DEFAULT_DOF
     downsampling: str = "masked"
     frames: str = "adaptive"
     layout: str = "factorised"
     features: str = "auto"
     model: str = ""
     steps: int | None = DEFAULT_STEPS
+    deadline_s: float | None = None
+    code: str = ""
+    demonstrations: str = ""
 
     def __post_init__(self) -> None:
         changed: dict[str, str | float | None] = {}
@@ -43,18 +49,20 @@ class Variant:
         elif self.method not in REGRESSING_METHODS:
             changed["dof"] = None
         if self.method not in ASKING_METHODS:
-            changed |= {"frames": "", "layout": "", "model": ""}
+            changed |= {"frames": "", "layout": "", "model": "", "deadline_s": None}
         for name, value in changed.items():
             object.__setattr__(self, name, value)
 
     @property
     def file_name(self) -> str:
         """Everything, so that no two variants have the same."""
-        words = (str(self), "" if self.features == "auto" else self.features, self.model)
+        features = "" if self.features == "auto" else self.features
+        deadline = "" if self.deadline_s is None else f"{self.deadline_s:g}s"
+        words = (str(self), features, self.model, deadline, self.code, self.demonstrations)
         return re.sub(r"[^\w.-]+", "_", "-".join(word for word in words if word))
 
     def __str__(self) -> str:
-        """Everything but image features and language model, in a few words."""
+        """What a reader chose, without network, language model and versions, in a few words."""
         dof = "" if self.dof is None else f"v{self.dof:g}"
         words = (
             self.method,
@@ -79,7 +87,7 @@ def labels(variants: Sequence[Variant]) -> list[str]:
     for variant in variants:
         same = [other for other in variants if other.method == variant.method]
         names = [field.name for field in fields(Variant) if len({getattr(other, field.name) for other in same}) > 1]
-        settings = ", ".join(f"{name} {getattr(variant, name)}" for name in names)
+        settings = ", ".join(f"{name} {getattr(variant, name) or 'unknown'}" for name in names)
         told.append(f"{variant.method} ({settings})" if settings else variant.method)
     return told
 

@@ -1,40 +1,51 @@
-"""What a worker works with: one simulator at a time, the policies that were fitted, the model."""
+"""What a worker works with: one simulator at a time, fitted policies, the model, and what was computed before.
+
+This is the only memory of an evaluation, keyed by values: contexts by the number of demonstrations and the settings
+that decide them; keypoints and samples of the present scene by the same. Methods, and numbers of queries, share them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, cast
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import KeypointError, ModelError, PlanningError
 from robust_instant_policy.evaluation.episodes import Episode
-from robust_instant_policy.evaluation.failures import Inquest, Truth, film, true_keypoints
+from robust_instant_policy.evaluation.failures import FailureAnalysis, Truth, film, true_keypoints
 from robust_instant_policy.evaluation.rollout import roll_out
 from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.evaluation.work import Analysis, Outcome, Planned, SceneWork, Setup
 from robust_instant_policy.llm import LanguageModel, RecordedModel, ReplayedModel, SampleStore, connect, model_name
 from robust_instant_policy.policies import (
-    IMAGE_METHODS,
     ClosedLoopPolicy,
-    InstantPolicy,
-    Policy,
+    Context,
+    KeypointActionTokens,
+    KeypointPolicy,
+    LocatedScene,
+    Plan,
+    Samples,
+    Settings,
     Training,
+    build_context,
+    locate,
     make_policy,
 )
+from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Task
+from robust_instant_policy.trajectory import Trajectory
 
 if TYPE_CHECKING:  # it needs the extra "train"
     from robust_instant_policy.policies.diffusion.training import TrainedPolicy
 
-AnyPolicy = Policy | ClosedLoopPolicy
-Context = tuple[int, str, str, str, str]  # demonstrations, downsampling, frames, layout, features
+ContextKey = tuple[int, Settings]  # number of demonstrations, and what decides the context beside them
 DemonstrationSource = Callable[[str, int], list[Demonstration]]  # task, how many
 
 
@@ -64,6 +75,8 @@ class Workbench:
         task = self._enter(work.scene)
         shown = self._show(work)
         observation = task.reset(work.scene.seed)
+        self._located.clear()
+        self._samples.clear()
         failed = list(work.failed)
         for variant in work.variants:
             done = {candidate for scene, other, candidate in work.done if (scene, other) == (work.scene, variant)}
@@ -74,7 +87,7 @@ class Workbench:
                     failed.append(episode)
         for variant in work.plans:
             policy = self._policy(variant, shown)
-            if not isinstance(policy, ClosedLoopPolicy):
+            if isinstance(policy, RememberingPolicy):
                 with suppress(KeypointError, PlanningError):
                     yield Planned(work.scene, variant, policy.plan(observation))
         yield from self._take_apart(task, work.scene, failed, shown, observation)
@@ -82,7 +95,8 @@ class Workbench:
     def train(self, work: SceneWork, variant: Variant) -> TrainedPolicy:
         """Make and train the policy of ``variant`` for the scenes of ``work``, as `run` would."""
         self._enter(work.scene)
-        return cast("TrainedPolicy", self._policy(variant, self._show(work)))
+        policy = self._policy(variant, self._show(work))
+        return cast("TrainedPolicy", policy.policy if isinstance(policy, RememberingPolicy) else policy)
 
     def close(self) -> None:
         if self._task is not None:
@@ -114,8 +128,10 @@ class Workbench:
     def _forget(self) -> None:
         self._shown: list[Demonstration] = []
         self._shown_truth: list[SceneTruth] = []
-        self._instants: dict[Context, InstantPolicy] = {}
-        self._policies: dict[Variant, AnyPolicy] = {}
+        self._contexts: dict[ContextKey, Context] = {}
+        self._policies: dict[Variant, RememberingPolicy | ClosedLoopPolicy] = {}
+        self._located: dict[ContextKey, LocatedScene] = {}  # these two of the present scene
+        self._samples: dict[ContextKey, Samples] = {}
 
     def _show(self, work: SceneWork) -> list[Demonstration]:
         if len(self._shown) < work.demos:
@@ -127,33 +143,47 @@ class Workbench:
         folder = demonstrations_folder(self._setup.data, task, with_images)
         return load_demonstrations(folder, task=task, limit=count)
 
-    def _instant(self, variant: Variant) -> InstantPolicy:
-        """Shared by all methods that start from the same keypoints and the same prompt."""
-        frames, layout = variant.frames or "adaptive", variant.layout or "factorised"
-        context = (variant.demos, variant.downsampling, frames, layout, variant.features)
-        if context not in self._instants:
-            assert self._task is not None
-            settings: dict[str, Any] = {"frames": frames, "layout": layout}
-            self._instants[context] = InstantPolicy(
-                _Later(self),
-                workspace=self._task.workspace,
-                downsampling=variant.downsampling,
-                features=variant.features,
-                deadline_s=self._setup.deadline_s,
-                **settings,
-            )
-        return self._instants[context]
+    def context(self, demos: int, settings: Settings) -> Context:
+        """Of the first ``demos`` demonstrations."""
+        key = demos, settings.of_context
+        if key not in self._contexts:
+            self._contexts[key] = build_context(self._shown[:demos], settings)
+        return self._contexts[key]
 
-    def _policy(self, variant: Variant, shown: Sequence[Demonstration]) -> AnyPolicy:
+    def plan(self, policy: KeypointPolicy, demos: int, observation: Observation) -> Plan:
+        """The plan for the present scene, of which ``observation`` is the image."""
+        key = demos, policy.settings.of_context
+        if key not in self._located:
+            self._located[key] = locate(policy.context_, observation)
+        if not isinstance(policy, KeypointActionTokens):
+            return policy.plan_scene(self._located[key])
+        asked = demos, policy.settings.of_samples
+        plan, self._samples[asked] = policy.plan_from(self._located[key], self._samples.get(asked, NO_SAMPLES))
+        return plan
+
+    def _settings(self, variant: Variant) -> Settings:
+        assert self._task is not None
+        settings = Settings(
+            features=variant.features, downsampling=variant.downsampling, num_queries=variant.queries
+        ).changed(workspace=self._task.workspace)
+        if variant.frames:  # empty for methods that write no prompt
+            settings = settings.changed(frames=variant.frames, layout=variant.layout)
+        return settings if variant.dof is None else settings.changed(dof=variant.dof)
+
+    def _policy(self, variant: Variant, shown: Sequence[Demonstration]) -> RememberingPolicy | ClosedLoopPolicy:
         if variant not in self._policies:
-            options: dict[str, Any] = {} if variant.dof is None else {"dof": variant.dof}
+            training = None
             if variant.steps is not None:
-                options["training"] = Training(self._setup.checkpoints, variant.steps, report=self._report)
-            policy = make_policy(variant.method, self._instant(variant), variant.queries, **options)
-            demonstrations = shown[: variant.demos]
-            if variant.method in IMAGE_METHODS:
-                demonstrations = self._read_demonstrations(self._place[0], variant.demos, with_images=True)
-            self._policies[variant] = policy.fit(demonstrations)
+                training = Training(self._setup.checkpoints, variant.steps, report=self._report)
+            model = cast(LanguageModel, _Later(self))
+            policy = make_policy(variant.method, model, self._settings(variant), training, self._setup.deadline_s)
+            if isinstance(policy, KeypointPolicy):
+                policy.fit_context(self.context(variant.demos, policy.settings))
+                self._policies[variant] = RememberingPolicy(self, policy, variant.demos)
+            elif isinstance(policy, ClosedLoopPolicy):
+                self._policies[variant] = policy.fit(
+                    self._read_demonstrations(self._place[0], variant.demos, with_images=True)
+                )
         return self._policies[variant]
 
     def _take_apart(
@@ -164,26 +194,24 @@ class Workbench:
         shown: Sequence[Demonstration],
         observation: Observation,
     ) -> Iterator[Analysis]:
-        inquest = Inquest(task, scene)
-        truths: dict[InstantPolicy, Truth | None] = {}
+        analysis = FailureAnalysis(task, scene)
+        truths: dict[ContextKey, Truth | None] = {}
+
+        def truth(demos: int, settings: Settings) -> Truth | None:
+            key = demos, settings.of_context
+            if key not in truths:
+                known = self._truth_of_demonstrations(scene.task, shown, demos)
+                context = self.context(demos, settings)
+                truths[key] = None if known is None else true_keypoints(task, scene.seed, context, known)
+            return truths[key]
+
         for episode in failed:
-            variant = episode.variant
-            policy, instant = self._policy(variant, shown), self._instant(variant)
-
-            def truth(instant: InstantPolicy = instant, demos: int = variant.demos) -> Truth | None:
-                if instant not in truths:
-                    known = self._truth_of_demonstrations(scene.task, shown, demos)
-                    truths[instant] = (
-                        None
-                        if known is None
-                        else true_keypoints(task, scene.seed, instant.context, shown[:demos], known)
-                    )
-                return truths[instant]
-
+            policy, demos = self._policy(episode.variant, shown), episode.variant.demos
+            settings = self._settings(episode.variant)
             try:
-                failure = inquest.examine(episode, policy, observation, instant.context, truth)
+                failure = analysis.examine(episode, policy, observation, partial(truth, demos, settings))
             except ModelError:
-                if self._setup.replay:  # nobody asked the model what it would have said with the true keypoints
+                if self._setup.replay:  # the samples for the true keypoints were never drawn
                     continue
                 raise
             task.reset(scene.seed)
@@ -210,8 +238,26 @@ class Workbench:
         return self._shown_truth[:demos]
 
 
+class RememberingPolicy:
+    """A fitted policy that shares what the workbench remembers of the present scene."""
+
+    def __init__(self, bench: Workbench, policy: KeypointPolicy, demos: int):
+        self._bench, self.policy, self._demos = bench, policy, demos
+        self.name = policy.name
+
+    def plan(self, observation: Observation) -> Plan:
+        return self._bench.plan(self.policy, self._demos, observation)
+
+    def plan_scene(self, scene: LocatedScene) -> Plan:
+        """From other keypoints, of which nothing is remembered."""
+        return self.policy.plan_scene(scene)
+
+    def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
+        return self.policy.executions(plan)
+
+
 class _Later:
-    """The workbench's model, which need not be there before it is asked."""
+    """The workbench's model, loaded when it is first used."""
 
     def __init__(self, bench: Workbench):
         self._bench = bench

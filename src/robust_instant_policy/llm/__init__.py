@@ -1,10 +1,11 @@
-"""Language models: any server that speaks OpenAI's protocol, any llama.cpp model file, and one that is embedded."""
+"""Language models: servers that speak OpenAI's protocol, llama.cpp model files, and the embedded model."""
 
 from robust_instant_policy.llm.connect import connect, model_name
-from robust_instant_policy.llm.model import LanguageModel, Listener, Sampling
+from robust_instant_policy.llm.model import DEADLINE_S, LanguageModel, Listener, Sampling, refusal_advice
 from robust_instant_policy.llm.store import RecordedModel, ReplayedModel, SampleStore
 
 __all__ = [
+    "DEADLINE_S",
     "LanguageModel",
     "Listener",
     "RecordedModel",
@@ -13,4 +14,5 @@ __all__ = [
     "Sampling",
     "connect",
     "model_name",
+    "refusal_advice",
 ]

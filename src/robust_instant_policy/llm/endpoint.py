@@ -3,69 +3,74 @@
 from __future__ import annotations
 
 import asyncio
-import os
+import contextlib
 import random
 import re
 import time
-import urllib.parse
-import urllib.request
-from collections.abc import AsyncIterator, Coroutine, Sequence
+from collections.abc import Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
-from typing import Any, Literal, TypeVar
+from dataclasses import replace
+from typing import Any, TypeVar
 
-import httpx2
-import openai
-from openai.types import Completion
-from openai.types.chat import ChatCompletion
-
-from robust_instant_policy.errors import ModelError
-from robust_instant_policy.llm.dialect import ServerFacts
-from robust_instant_policy.llm.model import NOBODY, Listener, Sampling, Tally, context_error, estimate_tokens
+from robust_instant_policy.errors import ModelError, RipError
+from robust_instant_policy.llm.dialect import Dialect, Server, Style, discover
+from robust_instant_policy.llm.model import (
+    NOBODY,
+    Listener,
+    Sampling,
+    Tally,
+    context_error,
+    estimate_tokens,
+    sample_seed,
+)
+from robust_instant_policy.llm.reply import Reply, UnreadableReplyError, as_map, read_reply
+from robust_instant_policy.llm.transport import Connection, RefusedError, UnavailableError
 from robust_instant_policy.query import Answer, Query
 
-KEY_VARIABLE = "OPENAI_API_KEY"
-CONNECT_TIMEOUT_S = 5.0
-FACTS_TIMEOUT_S = 5.0  # for what is asked besides the plan itself
 PATIENCE = 0.5  # share of the remaining time that one request may take, so that a hanging one can be repeated
+HEAD_START = 0.25  # share of the time for which the first request goes alone, so that refusals are met once
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 8.0  # between repeats; doubles from the first to the longest
 MAX_UNREACHABLE = 6  # refused connections in a row after which the server counts as absent, about 8 s
-MAX_REPLY_BYTES = 8 << 20
+FACTS_TIME_S = 10.0  # at most, for asking the server about itself
 MAX_CONCURRENT = 32  # requests under way at a time
-CHAT_MARGIN_TOKENS = 64  # for the words that chat models put around numbers
+# A reply that counts fewer prompt tokens than this share of the estimate read only a part of the prompt. Tokenizers
+# with words for " 12" need half of the estimate, all others more.
+TRUNCATED_SHARE = 0.45
+MIN_TOKENS_TO_TELL = 200  # below this the estimate is too coarse
 
-Style = Literal["chat", "completions"]
 Result = TypeVar("Result")
-
-_OPTIONAL_FIELDS = ("seed", "stop", "temperature")  # left out when a model does not take them
 
 
 class Endpoint:
     """The model ``model`` of the server at ``url`` (with its ``/v1``).
 
-    ``style`` is how it is asked; None chooses by the model's name and by what the server offers. The key is read
-    from ``OPENAI_API_KEY`` at each use, sent only to ``url``, and kept nowhere.
+    ``style`` is how it is asked; with None the server is asked which one suits, and the other is tried when it refuses.
+    The key is read from the environment at each use and sent only to ``url`` (see `transport`).
     """
 
     def __init__(self, url: str, model: str, style: Style | None = None):
         self.name = model
         self.url = url.rstrip("/")
-        self._style: Style | None = style
-        self._facts: ServerFacts | None = None
-        self._honours_n = True
-        self._left_out: set[str] = set()
-        self._length_field = "max_tokens"
+        self._style = style
+        self._told: dict[str, object] = {}  # replies to questions about the server
+        self._server: Server | None = None
+        self.dialect = Dialect.first(Server(), style)  # how the server is asked, as far as is known
+        self.is_known = False  # an answer has come in the present dialect
 
     @property
     def context_length(self) -> int | None:
-        return _run(self._learned()).context_length
+        return _run(self._facts()).context_length
 
     @property
     def counts_exactly(self) -> bool:
-        return _run(self._learned()).counts_tokens
+        return _run(self._facts()).counts_tokens
 
     def count_tokens(self, text: str) -> int:
-        return _run(self._counted(text))
+        async def count() -> int:
+            async with contextlib.aclosing(self.connection()) as connection:
+                return await self.count(connection, await self.learn(connection), text)
+
+        return _run(count())
 
     def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """See `LanguageModel.sample`."""
@@ -77,153 +82,124 @@ class Endpoint:
     def close(self) -> None:
         """Nothing is held between plans."""
 
-    def client(self) -> openai.AsyncOpenAI:
-        """A client that repeats nothing by itself and never takes in more than `MAX_REPLY_BYTES`."""
-        try:
-            transport = _BoundedTransport(proxy=_proxy(self.url))
-        except (ImportError, ValueError):  # its words may hold a password
-            raise ModelError(
-                f"the proxy that the environment names for {self.url} cannot be used; give it as http://host:port, or "
-                "put the server into no_proxy"
-            ) from None
-        return openai.AsyncOpenAI(
-            base_url=self.url,
-            api_key=_key() or "none",
-            max_retries=0,
-            http_client=httpx2.AsyncClient(transport=transport, headers={"Accept-Encoding": "identity"}),
-        )
+    def connection(self) -> Connection:
+        return Connection(self.url, has_answered=bool(self._told))
 
-    async def facts(self, client: openai.AsyncOpenAI) -> ServerFacts:
-        """What the server says of itself; one that says nothing is asked as plainly as OpenAI is."""
-        if self._facts is None:
-            try:
-                reply = await client.get("/models", cast_to=object, options={"timeout": FACTS_TIMEOUT_S})
-            except openai.APIConnectionError:
-                return ServerFacts()  # perhaps it answers the next time
-            except (openai.OpenAIError, ValueError):
-                reply = None
-            self._facts = ServerFacts.from_models(reply, self.name)
-        return self._facts
+    async def _facts(self) -> Server:
+        async with contextlib.aclosing(self.connection()) as connection:
+            return await self.learn(connection)
 
-    async def count(self, client: openai.AsyncOpenAI, text: str) -> int:
-        facts = await self.facts(client)
-        if facts.counts_tokens:
-            address = self.url.removesuffix("/v1") + "/tokenize"
-            body = facts.tokenize_body(self.name, text)
+    async def learn(self, connection: Connection, time_s: float = FACTS_TIME_S) -> Server:
+        """What the server tells of itself within ``time_s``; what it did not tell is asked again the next time."""
+        if self._server is not None:
+            return self._server
+        end = time.monotonic() + min(time_s, FACTS_TIME_S)
+
+        async def tell(address: str, body: dict[str, Any] | None = None) -> object:
+            if address not in self._told:
+                try:
+                    rest = max(end - time.monotonic(), 0.1)
+                    self._told[address] = await connection.request(address, body, rest * PATIENCE)
+                except RefusedError:
+                    self._told[address] = None
+            return self._told[address]
+
+        while self._server is None:
             try:
-                reply = await client.post(address, body=body, cast_to=object, options={"timeout": FACTS_TIMEOUT_S})
-            except (openai.OpenAIError, ValueError):
-                reply = None
-            count = facts.tokenize_count(reply)
-            if count is not None:
-                return count
+                self._server = await discover(tell, self.url, self.name)
+            except UnavailableError as failure:
+                if failure.absent or time.monotonic() + FIRST_PAUSE_S > end:
+                    break
+                await asyncio.sleep(FIRST_PAUSE_S)
+            else:
+                self.dialect = Dialect.first(self._server, self._style)
+        return self._server or Server()
+
+    async def count(self, connection: Connection, server: Server, text: str) -> int:
+        """The server's own count of tokens, an estimate where it has none."""
+        if server.counts_tokens:
+            is_llama = server.kind == "llamacpp"
+            body = {"content": text, "add_special": True} if is_llama else {"model": self.name, "prompt": text}
+            with contextlib.suppress(UnavailableError, RefusedError):
+                reply = await connection.request(self.url.removesuffix("/v1") + "/tokenize", body)
+                if isinstance(tokens := as_map(reply).get("tokens"), list):
+                    return len(tokens)
         return estimate_tokens(text)
 
-    async def ask(
-        self, client: openai.AsyncOpenAI, query: Query, count: int, temperature: float, seed: int, timeout_s: float
-    ) -> list[Answer]:
-        """One request for ``count`` answers; fewer come back from servers that do not know ``n``.
+    async def refuse_long(self, connection: Connection, server: Server, queries: Sequence[Query]) -> None:
+        """Raise `ModelError` for prompts that do not fit into the context, before they are sent."""
+        length = server.context_length
+        longest = max(queries, key=lambda query: len(query.text) + query.max_tokens)
+        if length is None or len(longest.text) + longest.max_tokens < length:  # a token is a character at least
+            return
+        tokens = await self.count(connection, server, longest.text)
+        if tokens + longest.max_tokens > length:
+            raise context_error(tokens, longest.max_tokens, length, server.counts_tokens)
 
-        Raises `openai.OpenAIError`, `ValueError` for a reply that makes no sense, and `ModelError` for a request
+    async def ask(
+        self, connection: Connection, query: Query, count: int, temperature: float, seed: int, timeout_s: float
+    ) -> Reply | None:
+        """One request for ``count`` answers; None when it has to be put differently (the dialect has changed).
+
+        Fewer come back from servers that do not know ``n``. Raises `UnavailableError`, and `ModelError` for a request
         that will never succeed.
         """
-        facts = await self.facts(client)
-        style = self._style or ("chat" if facts.prefers_chat(self.name) else "completions")
-        fields: dict[str, Any] = {"model": self.name, "temperature": temperature, "seed": seed}
-        if count > 1:
-            fields["n"] = count
-        if query.stop and style == "completions":  # a chat model may begin with other lines
-            fields["stop"] = list(query.stop)
-        fields[self._length_field] = query.max_tokens + (CHAT_MARGIN_TOKENS if style == "chat" else 0)
-        extra = {} if "constraint" in self._left_out else facts.constraint(query)
-        for name in self._left_out & fields.keys():
-            del fields[name]
-        timeout = httpx2.Timeout(timeout_s, connect=min(CONNECT_TIMEOUT_S, timeout_s))
+        used = self.dialect
+        body = used.body(self.name, query, count, temperature, seed)
         start = time.monotonic()
         try:
-            if style == "chat":
-                messages: list[Any] = [{"role": "user", "content": query.text}]
-                if query.instruction is not None:
-                    messages.insert(0, {"role": "system", "content": query.instruction})
-                reply: Any = await client.chat.completions.create(
-                    messages=messages, extra_body=extra, timeout=timeout, **fields
-                )
-            else:
-                reply = await client.completions.create(prompt=query.text, extra_body=extra, timeout=timeout, **fields)
-        except (openai.NotFoundError, openai.BadRequestError, openai.UnprocessableEntityError) as error:
-            self._adapt(error, style, fields, bool(extra))
-            return []
-        return await self._answers(client, reply, count, time.monotonic() - start)
+            content = await connection.request(self.url + used.path, body, timeout_s)
+            # llama.cpp counts the tokens of the first answer only.
+            counts_all = count == 1 or self._server is None or self._server.kind != "llamacpp"
+            reply = read_reply(content, count, time.monotonic() - start, counts_all)
+        except RefusedError as refusal:
+            self._adapt(used, refusal, body)
+            return None
+        except UnreadableReplyError as error:
+            raise UnavailableError(f"its reply could not be read ({error})") from None
+        self._refuse_truncated(query, reply.answers[0].prompt_tokens)
+        if len(reply.answers) < count and self.dialect == used:
+            self.dialect = replace(used, several=False)
+        return reply
 
-    def _adapt(self, error: openai.APIStatusError, style: Style, fields: dict[str, Any], constrained: bool) -> None:
-        """Ask differently from now on, in the way the server's complaint suggests, or raise `ModelError`."""
-        words = error.message.lower()
-        if isinstance(error, openai.NotFoundError):
-            if style == "completions" and self._style is None and "model" not in words:
-                self._style = "chat"
-                return
-        elif "context" in words and re.search(r"exceed|maximum|too long|length", words):
+    def make_room(self, used: Dialect, answer: Answer) -> None:
+        """Allow more tokens after ``answer`` was cut off; raise `ModelError` at the largest allowance."""
+        if self.dialect != used:
+            return
+        changed = used.with_more_room()
+        if changed is None:
+            raise ModelError(
+                f"{self.name} at {self.url} used up {used.margin_tokens} tokens without giving an answer "
+                f"({answer.fault}); switch off or shorten its reasoning in the server, or use another model"
+            )
+        self.dialect = changed
+
+    def _adapt(self, used: Dialect, refusal: RefusedError, body: dict[str, Any]) -> None:
+        """Ask differently from now on, or raise `ModelError`.
+
+        Where another request has changed the dialect meanwhile, the refusal is out of date: asking again tells.
+        """
+        words = refusal.complaint.message
+        if "context" in words.lower() and re.search(r"exceed|maximum|too long|length", words, re.IGNORECASE):
             raise ModelError(
                 f"the prompt does not fit into the context of {self.name}; use fewer demonstrations or steps, "
                 "or layout='factorised'"
             )
-        elif "max_completion_tokens" in words and self._length_field == "max_tokens":
-            self._length_field = "max_completion_tokens"
+        if self.dialect != used:
             return
-        elif "n" in fields and (getattr(error, "param", None) == "n" or re.search(r"['\"`]n['\"`]|\bn\b must", words)):
-            self._honours_n = False
-            return
-        else:
-            for name in _OPTIONAL_FIELDS:
-                if name in fields and name in words:
-                    self._left_out.add(name)
-                    return
-            if constrained and "constraint" not in self._left_out:
-                self._left_out.add("constraint")
-                return
-        raise ModelError(f"{self.url} refused the request for {self.name}: {scrubbed(error.message)}")
+        changed = used.adapted(refusal, body)
+        if changed is None:
+            advice = "; does the address end in /v1?" if used.tried and refusal.status in (404, 405) else ""
+            raise ModelError(f"{self.url} refused the request for {self.name}: {words}{advice}")
+        self.dialect = changed
 
-    async def _answers(self, client: openai.AsyncOpenAI, reply: Any, count: int, seconds: float) -> list[Answer]:
-        if not isinstance(reply, Completion | ChatCompletion) or not isinstance(reply.choices, list):
-            raise ValueError("the reply is not one of OpenAI's protocol")
-        texts = []
-        for choice in reply.choices[:count]:
-            message = getattr(choice, "message", None)
-            text = message.content if message is not None else getattr(choice, "text", None)
-            texts.append(text if isinstance(text, str) else "")
-        if not texts:
-            raise ValueError("the reply holds no answer")
-        if len(texts) < count:
-            self._honours_n = False
-        usage = reply.usage
-        details = getattr(usage, "prompt_tokens_details", None)
-        written = [await self.count(client, text) for text in texts] if len(texts) > 1 else [estimate_tokens(texts[0])]
-        if usage is not None and not (self._facts is not None and self._facts.is_llama_cpp and len(texts) > 1):
-            # The total is the server's; llama.cpp tells only the first answer's.
-            written = _shared_out(usage.completion_tokens or 0, written)
-        return [
-            Answer(
-                text,
-                prompt_tokens=(usage.prompt_tokens or 0) if usage is not None and index == 0 else 0,
-                cached_tokens=(getattr(details, "cached_tokens", None) or 0) if index == 0 else 0,
-                completion_tokens=tokens,
-                seconds=seconds,
+    def _refuse_truncated(self, query: Query, read: int) -> None:
+        sent = estimate_tokens(query.text)
+        if sent >= MIN_TOKENS_TO_TELL and 0 < read < TRUNCATED_SHARE * sent:
+            raise ModelError(
+                f"{self.name} at {self.url} read only {read} of about {sent} tokens of the prompt; raise the server's "
+                "context (Ollama: OLLAMA_CONTEXT_LENGTH or num_ctx), or use fewer demonstrations or layout='factorised'"
             )
-            for index, (text, tokens) in enumerate(zip(texts, written, strict=True))
-        ]
-
-    @property
-    def honours_n(self) -> bool:
-        """Whether several answers can be had from one request, as far as is known."""
-        return self._honours_n
-
-    async def _learned(self) -> ServerFacts:
-        async with self.client() as client:
-            return await self.facts(client)
-
-    async def _counted(self, text: str) -> int:
-        async with self.client() as client:
-            return await self.count(client, text)
 
 
 class _Plan:
@@ -233,19 +209,29 @@ class _Plan:
         self._endpoint, self._queries, self._tally, self._sampling = endpoint, queries, tally, sampling
         self._deadline = time.monotonic() + sampling.deadline_s
         self._room = asyncio.Semaphore(MAX_CONCURRENT)
+        self._opened = asyncio.Event()  # the first request has met the server
         self._unreachable = 0
         self._last_failure = "nothing came back"
 
     async def carry_out(self) -> None:
-        failure: ModelError | None = None
+        failure: RipError | None = None
         try:
-            async with asyncio.timeout(self._sampling.deadline_s), self._endpoint.client() as client:
-                await self._refuse_long(client)
+            async with (
+                asyncio.timeout(self._sampling.deadline_s),
+                contextlib.aclosing(self._endpoint.connection()) as connection,
+            ):
+                server = await self._endpoint.learn(connection, HEAD_START * self._sampling.deadline_s)
+                await self._endpoint.refuse_long(connection, server, self._queries)
                 try:
                     async with asyncio.TaskGroup() as group:
-                        for index in range(len(self._queries)):
-                            group.create_task(self._fill(client, index))
-                except* ModelError as errors:
+                        group.create_task(self._fill(connection, 0))
+                        if not self._endpoint.is_known:
+                            with contextlib.suppress(TimeoutError):
+                                await asyncio.wait_for(self._opened.wait(), HEAD_START * self._sampling.deadline_s)
+                        self._opened.set()
+                        for index in range(1, len(self._queries)):
+                            group.create_task(self._fill(connection, index))
+                except* RipError as errors:
                     failure = _first(errors)
         except TimeoutError:
             pass
@@ -257,151 +243,63 @@ class _Plan:
                 f"{self._last_failure}"
             )
 
-    async def _refuse_long(self, client: openai.AsyncOpenAI) -> None:
-        facts = await self._endpoint.facts(client)
-        length = facts.context_length
-        longest = max(self._queries, key=lambda query: len(query.text) + query.max_tokens)
-        if length is None or len(longest.text) + longest.max_tokens < length:  # a token is a character at least
-            return
-        tokens = await self._endpoint.count(client, longest.text)
-        if tokens + longest.max_tokens > length:
-            raise context_error(tokens, longest.max_tokens, length, facts.counts_tokens)
-
-    async def _fill(self, client: openai.AsyncOpenAI, index: int) -> None:
+    async def _fill(self, connection: Connection, index: int) -> None:
         """Ask until the query has all its answers."""
         while missing := self._tally.missing(index):
-            if self._endpoint.honours_n:
-                await self._ask(client, index, missing)
+            if self._endpoint.dialect.several:
+                await self._ask(connection, index, missing)
+            elif not self._opened.is_set():
+                await self._ask(connection, index, missing[:1])
             else:
                 async with asyncio.TaskGroup() as group:
                     for sample in missing:
-                        group.create_task(self._ask(client, index, [sample]))
+                        group.create_task(self._ask(connection, index, [sample]))
 
-    async def _ask(self, client: openai.AsyncOpenAI, index: int, samples: list[int]) -> None:
+    async def _ask(self, connection: Connection, index: int, samples: list[int]) -> None:
         """One request, repeated with growing pauses until something comes back."""
         pause = FIRST_PAUSE_S
         while True:
-            wait: float | None = None
             try:
                 async with self._room:
-                    answers = await self._endpoint.ask(
-                        client,
+                    used = self._endpoint.dialect
+                    if len(samples) > 1 and not used.several:
+                        return
+                    reply = await self._endpoint.ask(
+                        connection,
                         self._queries[index],
                         len(samples),
                         self._sampling.temperature,
-                        _seed(self._sampling.seed, samples[0], self._tally.attempt(index, samples[0])),
+                        sample_seed(self._sampling.seed, samples[0], self._tally.attempt(index, samples[0])),
                         max(PATIENCE * (self._deadline - time.monotonic()), 0.1),
                     )
                 self._unreachable = 0
-                for sample, answer in zip(samples, answers, strict=False):
+                if reply is None:
+                    continue
+                for sample, answer in zip(samples, reply.answers, strict=False):
                     self._tally.add(index, sample, answer)
+                if reply.ran_out and (reply.thought or used.style == "chat") and not self._tally.has_accepted:
+                    self._endpoint.make_room(used, reply.answers[0])
+                else:
+                    self._endpoint.is_known = True
+                    self._opened.set()
                 return
-            except openai.APITimeoutError:
-                self._last_failure = "it did not answer in time"
-            except openai.APIConnectionError as error:
-                self._last_failure = f"the connection failed ({scrubbed(str(error.__cause__ or error))})"
-                if isinstance(error.__cause__, httpx2.ConnectError):
-                    self._unreachable += 1
-                    if self._unreachable >= MAX_UNREACHABLE:
-                        raise ModelError(
-                            f"nothing answers at {self._endpoint.url}; is the server running, and the address right?"
-                        ) from None
-            except openai.APIStatusError as error:
-                if error.status_code not in (408, 409, 429) and error.status_code < 500:
-                    raise ModelError(_refusal(self._endpoint, error)) from None
-                self._last_failure = f"it answered {error.status_code} ({scrubbed(error.message)})"
-                wait = _retry_after(error.response)
-            except (openai.OpenAIError, ValueError) as error:
-                self._last_failure = f"its reply could not be read ({scrubbed(str(error))})"
-            await asyncio.sleep(wait if wait is not None else pause * random.uniform(0.5, 1.0))
-            pause = min(2 * pause, LONGEST_PAUSE_S)
+            except UnavailableError as failure:
+                self._last_failure = str(failure)
+                self._unreachable = self._unreachable + 1 if failure.absent else 0
+                if self._unreachable >= MAX_UNREACHABLE:
+                    raise ModelError(
+                        f"nothing answers at {self._endpoint.url} ({failure}); is the server running, and the address "
+                        "right?"
+                    ) from None
+                # A server that asks for no pause, or for less, is not asked faster than others.
+                await asyncio.sleep(max(failure.wait_s, pause * random.uniform(0.5, 1.0)))
+                pause = min(2 * pause, LONGEST_PAUSE_S)
 
 
-class _BoundedTransport(httpx2.AsyncHTTPTransport):
-    """Breaks off replies that are larger than any answer, or packed so that their size cannot be told."""
-
-    async def handle_async_request(self, request: httpx2.Request) -> httpx2.Response:
-        response = await super().handle_async_request(request)
-        if response.headers.get("Content-Encoding", "identity") != "identity":
-            await response.aclose()
-            raise httpx2.RemoteProtocolError("the reply is compressed although that was not asked for")
-        assert isinstance(response.stream, httpx2.AsyncByteStream)
-        response.stream = _BoundedStream(response.stream)
-        return response
-
-
-class _BoundedStream(httpx2.AsyncByteStream):
-    def __init__(self, stream: httpx2.AsyncByteStream):
-        self._stream = stream
-
-    async def __aiter__(self) -> AsyncIterator[bytes]:
-        size = 0
-        async for chunk in self._stream:
-            size += len(chunk)
-            if size > MAX_REPLY_BYTES:
-                raise httpx2.RemoteProtocolError(f"the reply is longer than {MAX_REPLY_BYTES >> 20} MB")
-            yield chunk
-
-    async def aclose(self) -> None:
-        await self._stream.aclose()
-
-
-def scrubbed(words: str, length: int = 200) -> str:
-    """A message for the user: one short line, without anything that looks like a key."""
-    key = os.environ.get(KEY_VARIABLE, "").strip()
-    if key:
-        words = words.replace(key, "***")
-    words = re.sub(r"\b(sk|key)-[\w*-]{4,}", "***", words)
-    words = " ".join(words.split())
-    return words if len(words) <= length else words[:length] + "…"
-
-
-def _key() -> str:
-    """The key, without the line break that files and pipes leave behind it; raises `ModelError` where it is none."""
-    key = os.environ.get(KEY_VARIABLE, "").strip()
-    if not (key.isascii() and key.isprintable()):
-        raise ModelError(f"{KEY_VARIABLE} holds characters that no key has; set it to the key alone")
-    return key
-
-
-def _proxy(url: str) -> str | None:
-    """The proxy that the environment names for ``url``; none for this machine itself."""
-    parts = urllib.parse.urlsplit(url)
-    host = parts.hostname or ""
-    if host == "localhost" or host.startswith("127.") or host == "::1" or urllib.request.proxy_bypass(host):
-        return None
-    proxies = urllib.request.getproxies()
-    proxy = proxies.get(parts.scheme) or proxies.get("all")
-    return f"http://{proxy}" if proxy and "://" not in proxy else proxy
-
-
-def _first(errors: BaseExceptionGroup[ModelError]) -> ModelError:
+def _first(errors: BaseExceptionGroup[RipError]) -> RipError:
     """The first of the errors in a group, however deep groups are nested."""
     first = errors.exceptions[0]
     return _first(first) if isinstance(first, BaseExceptionGroup) else first
-
-
-def _refusal(endpoint: Endpoint, error: openai.APIStatusError) -> str:
-    if error.status_code in (401, 403):
-        return f"{endpoint.url} refused the key ({error.status_code}); set {KEY_VARIABLE} to a valid one"
-    return f"{endpoint.url} refused the request for {endpoint.name}: {scrubbed(error.message)}"
-
-
-def _retry_after(response: httpx2.Response) -> float | None:
-    try:
-        return min(max(float(response.headers["Retry-After"]), 0.0), 60.0)
-    except (KeyError, ValueError):
-        return None
-
-
-def _shared_out(total: int, weights: Sequence[int]) -> list[int]:
-    """``total`` split in proportion to ``weights``; the parts add up to it."""
-    edges = [round(total * sum(weights[:end]) / max(sum(weights), 1)) for end in range(len(weights))] + [total]
-    return [stop - start for start, stop in pairwise(edges)]
-
-
-def _seed(seed: int, sample: int, attempt: int) -> int:
-    return (seed * 1_000_003 + attempt * 10_007 + sample) % 2**31
 
 
 def _run(work: Coroutine[Any, Any, Result]) -> Result:

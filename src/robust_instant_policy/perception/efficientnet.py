@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -15,11 +14,7 @@ from robust_instant_policy.perception.descriptors import DescriptorMap, Float32A
 from robust_instant_policy.perception.settings import DescriptorSettings
 
 NETWORK = "efficientnet-lite0"
-STRIDES = (
-    4,
-    8,
-    16,
-)  # input pixels between the cells of the blocks whose outputs are descriptors: the last ones at each
+STRIDES = (4, 8, 16)  # input pixels between the cells of the three blocks whose outputs are descriptors
 FINEST_STRIDE, COARSEST_STRIDE = STRIDES[0], STRIDES[-1]
 MEAN = np.array((0.485, 0.456, 0.406), dtype=np.float32)
 DEVIATION = np.array((0.229, 0.224, 0.225), dtype=np.float32)
@@ -41,7 +36,7 @@ class EfficientNetDescriptors:
     def __init__(self, settings: DescriptorSettings, network: Any = None, name: str = NETWORK):
         self.name = name
         self._settings = settings
-        self._backbone = _default_backbone() if network is None else _Backbone.of(network)
+        self._network = load_network() if network is None else network
 
     def describe(self, rgb: NDArray[np.uint8]) -> DescriptorMap:
         height, width = rgb.shape[:2]
@@ -67,7 +62,7 @@ class EfficientNetDescriptors:
         """Features ``(rows, cols, D)`` at all `STRIDES`, each scaled to length one and sampled where the finest
         one's cells lie, of a normalised image ``(H, W, 3)``."""
         levels = []
-        for level in self._backbone(image):
+        for level in block_outputs(self._network, image):
             lengths = np.sqrt(np.einsum("rcd,rcd->rc", level, level))
             levels.append(level / np.maximum(lengths, TINY)[..., None])
         rows, cols = levels[0].shape[:2]
@@ -104,91 +99,24 @@ def load_network() -> Any:
     return network.eval().requires_grad_(False)
 
 
-@dataclass(frozen=True, eq=False)
-class _Convolution:
-    """A convolution with the batch normalisation behind it folded in, "same" padding as in TensorFlow."""
+def block_outputs(network: Any, image: Float32Array) -> list[Float32Array]:
+    """Outputs ``(rows, cols, D)`` of the last block at each of `STRIDES`, for a normalised image ``(H, W, 3)``."""
+    import torch
+    from efficientnet_lite_pytorch.model import MBConvBlock
 
-    weight: Any
-    bias: Any
-    stride: int
+    at_stride: dict[int, torch.Tensor] = {}
 
-    @classmethod
-    def folded(cls, convolution: Any, normalisation: Any) -> _Convolution:
-        import torch
+    def keep(_block: Any, _inputs: Any, output: Any) -> None:
+        at_stride[image.shape[0] // output.shape[2]] = output  # later blocks replace earlier ones
 
-        scale = normalisation.weight / torch.sqrt(normalisation.running_var + normalisation.eps)
-        weight = (convolution.weight * scale[:, None, None, None]).contiguous(memory_format=torch.channels_last)
-        return cls(weight, normalisation.bias - normalisation.running_mean * scale, convolution.stride[0])
-
-    def __call__(self, state: Any) -> Any:
-        from torch.nn import functional as F
-
-        size, groups = self.weight.shape[2], state.shape[1] // self.weight.shape[1]
-        if self.stride == 1:
-            return F.conv2d(state, self.weight, self.bias, padding=size // 2, groups=groups)
-        needed = [(-(-edge // self.stride) - 1) * self.stride + size - edge for edge in state.shape[:1:-1]]
-        padding = [part for total in needed for part in (max(total, 0) // 2, max(total, 0) - max(total, 0) // 2)]
-        return F.conv2d(F.pad(state, padding), self.weight, self.bias, self.stride, groups=groups)
-
-
-@dataclass(frozen=True, eq=False)
-class _Block:
-    """An inverted residual: widen (not in the first block), filter each channel, narrow, and add the input."""
-
-    expand: _Convolution | None
-    filter: _Convolution
-    project: _Convolution
-    adds_input: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _Backbone:
-    """The network up to the coarsest of `STRIDES`, made for speed: half the time of the package's pass, same numbers.
-
-    ``wanted`` numbers the blocks whose outputs are descriptors.
-    """
-
-    stem: _Convolution
-    blocks: tuple[_Block, ...]
-    wanted: tuple[int, ...]
-
-    @classmethod
-    def of(cls, network: Any) -> _Backbone:
-        stem = _Convolution.folded(network._conv_stem, network._bn0)
-        stride, blocks, last = stem.stride, [], {}
-        for index, block in enumerate(network._blocks):
-            shape = block._block_args
-            expand = _Convolution.folded(block._expand_conv, block._bn0) if shape.expand_ratio != 1 else None
-            channels = _Convolution.folded(block._depthwise_conv, block._bn1)
-            project = _Convolution.folded(block._project_conv, block._bn2)
-            stride *= channels.stride
-            if stride > COARSEST_STRIDE:
-                break
-            adds_input = channels.stride == 1 and shape.input_filters == shape.output_filters
-            blocks.append(_Block(expand, channels, project, adds_input))
-            last[stride] = index
-        return cls(stem, tuple(blocks), tuple(last[stride] for stride in STRIDES))
-
-    def __call__(self, image: Float32Array) -> list[Float32Array]:
-        """Outputs ``(rows, cols, D)`` of the wanted blocks for an image ``(H, W, 3)``."""
-        import torch
-        from torch.nn.functional import relu6
-
-        outputs = []
+    hooks = [block.register_forward_hook(keep) for block in network.modules() if isinstance(block, MBConvBlock)]
+    try:
         with torch.inference_mode():
-            state = relu6(self.stem(torch.from_numpy(image).permute(2, 0, 1)[None]), inplace=True)
-            for index, block in enumerate(self.blocks):
-                wide = state if block.expand is None else relu6(block.expand(state), inplace=True)
-                narrow = block.project(relu6(block.filter(wide), inplace=True))
-                state = narrow + state if block.adds_input else narrow
-                if index in self.wanted:
-                    outputs.append(state[0].permute(1, 2, 0).contiguous().numpy())
-        return outputs
-
-
-@cache
-def _default_backbone() -> _Backbone:
-    return _Backbone.of(load_network())
+            network.extract_features(torch.from_numpy(image).permute(2, 0, 1)[None])
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return [at_stride[stride][0].permute(1, 2, 0).contiguous().numpy() for stride in STRIDES]
 
 
 @cache

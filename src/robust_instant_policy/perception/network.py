@@ -38,6 +38,14 @@ def choose_network(features: str | DescriptorNetwork, settings: DescriptorSettin
     )
 
 
+def resolve_features(features: str) -> str:
+    """``features``, with the name of the network that `choose_network` takes in the place of ``"auto"``."""
+    if features != "auto":
+        return features
+    model = DescriptorSettings.model
+    return os.environ.get(WEIGHTS_VARIABLE) or (model if _is_cached(model) else "efficientnet")
+
+
 def _is_cached(name: str) -> bool:
     from robust_instant_policy.perception.vit_checkpoint import cached_folder
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robust_instant_policy.geometry import FloatArray, transform_points
+from robust_instant_policy.geometry import FloatArray, fit_upright, rotations_about_vertical, transform_points
 from robust_instant_policy.perception.descriptors import Float32Array
 
 TURN_BINS = 24
@@ -33,38 +33,6 @@ FINALISTS = 3
 COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)
 PATCH_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
 FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
-
-
-def turns_about_vertical(angles: FloatArray) -> FloatArray:
-    """Rotations ``(..., 3, 3)`` by ``angles (...)`` radians about the world's z axis."""
-    cos, sin, zero = np.cos(angles), np.sin(angles), np.zeros_like(angles)
-    rows = [cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1]
-    return np.stack(rows, axis=-1).reshape(*np.shape(angles), 3, 3)
-
-
-def upright_motions(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
-    """Motions ``(..., 4, 4)`` that turn about the vertical only and carry ``source (..., N, 3)`` onto
-    ``target (..., N, 3)`` with the least squared error under ``weights (..., N)``.
-    """
-    share = weights / weights.sum(axis=-1, keepdims=True)
-    source_mean = (share[..., None, :] @ source)[..., 0, :]
-    target_mean = (share[..., None, :] @ target)[..., 0, :]
-    a = source[..., :2] - source_mean[..., None, :2]
-    b = target[..., :2] - target_mean[..., None, :2]
-    return _motions(np.swapaxes(a * share[..., None], -1, -2) @ b, source_mean, target_mean)
-
-
-def _motions(products: FloatArray, source_mean: FloatArray, target_mean: FloatArray) -> FloatArray:
-    """The upright motions that fit best, from the weighted sums ``(..., 2, 2)`` of the products of the points'
-    horizontal coordinates about their means ``(..., 3)``.
-    """
-    sine = products[..., 0, 1] - products[..., 1, 0]
-    rotation = turns_about_vertical(np.arctan2(sine, products[..., 0, 0] + products[..., 1, 1]))
-    motion = np.zeros((*rotation.shape[:-2], 4, 4))
-    motion[..., :3, :3] = rotation
-    motion[..., :3, 3] = target_mean - (rotation @ source_mean[..., None])[..., 0]
-    motion[..., 3, 3] = 1
-    return motion
 
 
 def proposals(source: FloatArray, target: FloatArray, similarities: Float32Array) -> FloatArray:
@@ -99,7 +67,7 @@ def proposals(source: FloatArray, target: FloatArray, similarities: Float32Array
         agree = np.zeros(len(p))
         for near in (turn - 1, turn, turn + 1):
             agree += (np.abs(bins[near % TURN_BINS] - (x, y)) <= 1).all(axis=1)
-        motions.append(upright_motions(p + middle, q, weight * (agree > 0)))
+        motions.append(fit_upright(p + middle, q, weight * (agree > 0)))
         votes[np.arange(turn - 3, turn + 4) % TURN_BINS, max(0, x - 3) : x + 4, max(0, y - 3) : y + 4] = 0
     return np.array(motions)
 
@@ -135,7 +103,7 @@ def polish(
 def turned(motion: FloatArray, middle: FloatArray, angles: FloatArray) -> FloatArray:
     """``motion (4, 4)`` followed by upright turns by ``angles (A,)`` about ``middle (3,)``: ``(A, 4, 4)``."""
     result = np.repeat(motion[None], len(angles), axis=0)
-    result[:, :3, :3] = turns_about_vertical(angles) @ motion[:3, :3]
+    result[:, :3, :3] = rotations_about_vertical(angles) @ motion[:3, :3]
     result[:, :3, 3] += (motion[:3, :3] - result[:, :3, :3]) @ middle
     return result
 
@@ -166,7 +134,7 @@ def closest_points(
             weights = np.concatenate([np.exp(-forth_cost / reach**2), own * np.exp(-back_cost / reach**2)], axis=1)
             source_points = np.concatenate([np.broadcast_to(places, (count, size, 3)), places[back]], axis=1)
             target_points = np.concatenate([goals[forth], np.broadcast_to(goals, (count, len(goals), 3))], axis=1)
-            motions = upright_motions(source_points, target_points, weights + np.float32(1e-9))
+            motions = fit_upright(source_points, target_points, weights + np.float32(1e-9))
         else:
             explained = (own * np.exp(-back_cost / NEAR_M**2)).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
             fits = np.sqrt(np.exp(-forth_cost / NEAR_M**2).mean(axis=1) * explained)

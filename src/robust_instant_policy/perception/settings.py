@@ -1,4 +1,4 @@
-"""How descriptors are computed: the paper's two parameter columns by name (Oh et al. 2025, Table III)."""
+"""How descriptors are computed: the paper's two parameter columns by name (Oh et al. 2025, Table II)."""
 
 from __future__ import annotations
 

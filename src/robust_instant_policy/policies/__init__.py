@@ -1,5 +1,11 @@
-"""Policies: methods that know no task."""
+"""Policies: methods that know no task.
 
+A method over keypoints is a walk through pure stages: `build_context`, `locate`, `sample`, `propose`, `aggregate`.
+"""
+
+import warnings
+
+from robust_instant_policy.policies.aggregation import aggregate
 from robust_instant_policy.policies.catalogue import (
     ASKING_METHODS,
     IMAGE_METHODS,
@@ -9,36 +15,54 @@ from robust_instant_policy.policies.catalogue import (
     make_policy,
     make_trained_policy,
 )
+from robust_instant_policy.policies.context import Context, LocatedScene, build_context, locate
 from robust_instant_policy.policies.gp import KeypointRegression
-from robust_instant_policy.policies.instant import InstantPolicy, Proposal
-from robust_instant_policy.policies.kat import KeypointActionTokens
-from robust_instant_policy.policies.keypoint_context import KeypointContext
+from robust_instant_policy.policies.instant import KeypointActionTokens
+from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
 from robust_instant_policy.policies.neighbours import Neighbours
 from robust_instant_policy.policies.policy import ClosedLoopPolicy, Plan, Policy, Progress, Stage, Usage
-from robust_instant_policy.policies.rip import DOF, RobustInstantPolicy
+from robust_instant_policy.policies.rip import RobustInstantPolicy
+from robust_instant_policy.policies.sampling import Proposal, Samples, propose, sample
+from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.policies.training import Training
 
 __all__ = [
     "ASKING_METHODS",
-    "DOF",
     "IMAGE_METHODS",
     "METHOD_NAMES",
     "REGRESSING_METHODS",
     "TRAINED_METHODS",
     "ClosedLoopPolicy",
-    "InstantPolicy",
+    "Context",
     "KeypointActionTokens",
-    "KeypointContext",
+    "KeypointPolicy",
     "KeypointRegression",
+    "LocatedScene",
     "Neighbours",
     "Plan",
     "Policy",
     "Progress",
     "Proposal",
     "RobustInstantPolicy",
+    "Samples",
+    "Settings",
     "Stage",
     "Training",
     "Usage",
+    "aggregate",
+    "build_context",
+    "locate",
     "make_policy",
     "make_trained_policy",
+    "propose",
+    "sample",
 ]
+
+_RENAMED = {"KeypointContext": "Settings", "InstantPolicy": "KeypointActionTokens"}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _RENAMED:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warnings.warn(f"{name} is called {_RENAMED[name]} now", DeprecationWarning, stacklevel=2)
+    return globals()[_RENAMED[name]]

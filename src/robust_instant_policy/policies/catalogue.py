@@ -3,59 +3,60 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from robust_instant_policy.errors import MissingExtraError, UnknownNameError
+from robust_instant_policy.llm import DEADLINE_S, LanguageModel
 from robust_instant_policy.policies.gp import KeypointRegression
-from robust_instant_policy.policies.instant import InstantPolicy
-from robust_instant_policy.policies.kat import KeypointActionTokens
-from robust_instant_policy.policies.keypoint_context import KeypointContext
+from robust_instant_policy.policies.instant import KeypointActionTokens
 from robust_instant_policy.policies.neighbours import Neighbours
 from robust_instant_policy.policies.policy import ClosedLoopPolicy, Policy
-from robust_instant_policy.policies.rip import DOF, RobustInstantPolicy
+from robust_instant_policy.policies.rip import RobustInstantPolicy
+from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.policies.training import Training
 
 if TYPE_CHECKING:
     from robust_instant_policy.policies.diffusion import ImageDiffusion, KeypointDiffusion
 
-MOST_QUERIES = 10  # limit of the adaptive method, unless more are asked for
+MAX_ADAPTIVE_QUERIES = 10  # limit of rip-adaptive, unless more are asked for
 
-_METHODS: dict[str, Callable[[InstantPolicy, int, float, Training], Policy | ClosedLoopPolicy]] = {
-    "rip": lambda instant, queries, dof, _: RobustInstantPolicy(instant, num_queries=queries, dof=dof),
-    "rip-gauss": lambda instant, queries, *_: RobustInstantPolicy(instant, num_queries=queries, dof=math.inf),
-    "rip-adaptive": lambda instant, queries, dof, _: RobustInstantPolicy(
-        instant, num_queries=max(queries, MOST_QUERIES), dof=dof, adaptive=True
-    ),
-    "kat": lambda instant, queries, *_: KeypointActionTokens(instant, num_queries=queries),
-    "dp": lambda instant, queries, dof, training: make_trained_policy("dp", instant.context, training),
-    "kat-dp": lambda instant, queries, dof, training: make_trained_policy("kat-dp", instant.context, training, queries),
-    "neighbours": lambda instant, queries, *_: Neighbours(instant.context, num_queries=queries),
-    "gp": lambda instant, *_: KeypointRegression(instant.context),
-}
-METHOD_NAMES = tuple(_METHODS)
+METHOD_NAMES = ("rip", "rip-gauss", "rip-adaptive", "kat", "dp", "kat-dp", "neighbours", "gp")
 ASKING_METHODS = ("rip", "rip-gauss", "rip-adaptive", "kat")  # those that ask the language model
 REGRESSING_METHODS = ("rip", "rip-gauss", "rip-adaptive")  # those that have a ν
 TRAINED_METHODS = ("dp", "kat-dp")  # those that take minutes or hours to fit
-IMAGE_METHODS = ("dp",)  # those whose demonstrations need images along the way
+IMAGE_METHODS = ("dp",)  # those whose demonstrations need images of the whole episode
 
 
 def make_policy(
-    name: str, instant: InstantPolicy, num_queries: int = 5, dof: float = DOF, training: Training | None = None
+    name: str,
+    llm: LanguageModel,
+    settings: Settings,
+    training: Training | None = None,
+    deadline_s: float = DEADLINE_S,
 ) -> Policy | ClosedLoopPolicy:
-    """The method ``name`` over ``instant``, which several methods may share; raises `UnknownNameError`.
+    """The method ``name``, not yet fitted; raises `UnknownNameError`.
 
-    Call its ``fit(demonstrations)`` before anything else: what methods share is done only once, and what must be
-    trained is trained as ``training`` says. Raises `MissingExtraError` where that needs what is not installed.
+    Those of `TRAINED_METHODS` train as ``training`` says, and raise `MissingExtraError` without their extra.
     """
-    if name not in _METHODS:
+    if name not in METHOD_NAMES:
         raise UnknownNameError("method", name, METHOD_NAMES)
-    return _METHODS[name](instant, num_queries, dof, training or Training())
+    if name in TRAINED_METHODS:
+        return make_trained_policy(name, settings, training or Training())
+    if name == "neighbours":
+        return Neighbours(settings)
+    if name == "gp":
+        return KeypointRegression(settings)
+    if name == "kat":
+        return KeypointActionTokens(llm, settings, deadline_s=deadline_s)
+    if name == "rip-gauss":
+        settings = replace(settings, dof=math.inf)
+    elif name == "rip-adaptive":
+        settings = replace(settings, adaptive=True, num_queries=max(settings.num_queries, MAX_ADAPTIVE_QUERIES))
+    return RobustInstantPolicy(llm, settings, deadline_s=deadline_s)
 
 
-def make_trained_policy(
-    name: str, context: KeypointContext, training: Training, num_queries: int = 5
-) -> KeypointDiffusion | ImageDiffusion:
+def make_trained_policy(name: str, settings: Settings, training: Training) -> KeypointDiffusion | ImageDiffusion:
     """The one of `TRAINED_METHODS` called ``name``; raises `MissingExtraError` without PyTorch and diffusers."""
     try:
         from robust_instant_policy.policies.diffusion import ImageDiffusion, KeypointDiffusion
@@ -63,4 +64,4 @@ def make_trained_policy(
         if error.name and error.name.startswith("robust_instant_policy"):
             raise
         raise MissingExtraError(error.name or "diffusers", "train") from error
-    return ImageDiffusion(training) if name == "dp" else KeypointDiffusion(context, num_queries, training)
+    return ImageDiffusion(training) if name == "dp" else KeypointDiffusion(settings, training)

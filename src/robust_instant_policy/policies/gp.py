@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -12,13 +11,12 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from robust_instant_policy.context.alignment import align
-from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.policies.instant import Proposal
-from robust_instant_policy.policies.keypoint_context import KeypointContext
-from robust_instant_policy.policies.policy import Plan, Stopwatch, Usage
-from robust_instant_policy.policies.rip import robust_plan
+from robust_instant_policy.policies.aggregation import agree, make_plan
+from robust_instant_policy.policies.context import Context, LocatedScene
+from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
+from robust_instant_policy.policies.policy import Plan, Stopwatch
+from robust_instant_policy.policies.sampling import Proposal
 from robust_instant_policy.trajectory import Trajectory
 
 # The kernel's parameters, of which the likelihood chooses the logarithms: how much of the outputs' variance is linear
@@ -78,40 +76,29 @@ def _misfit(parameters: FloatArray, inputs: FloatArray, targets: FloatArray) -> 
     return 0.5 * float(determinant + (targets * cho_solve(factor, targets)).sum()) / targets.size
 
 
-class KeypointRegression:
-    """The trajectory as a Gaussian process of the scene's keypoints, in the world frame; ``context`` may be shared."""
+class KeypointRegression(KeypointPolicy):
+    """The trajectory as a Gaussian process of the scene's keypoints, in the world frame."""
 
     name = "gp"
     process_: GaussianProcess
 
-    def __init__(self, context: KeypointContext):
-        self.context = context
-
-    def fit(self, demonstrations: Sequence[Demonstration]) -> Self:
-        """Find keypoints and the kernel's parameters, in a fraction of a second; returns itself."""
-        self.context.fit(demonstrations)
-        self._written = self.context.trajectories_
-        aligned = align(self._written)
-        keypoints = self.context.keypoints_[list(aligned.kept)]
+    def fit_context(self, context: Context) -> Self:
+        """Find the kernel's parameters, in a fraction of a second; returns itself."""
+        super().fit_context(context)
+        aligned = align(context.trajectories)
+        keypoints = context.keypoints[list(aligned.kept)]
         self._shape = aligned.actions.shape[1:]
         self.process_ = GaussianProcess.fitted(
             keypoints.reshape(len(keypoints), -1), aligned.actions.reshape(len(keypoints), -1)
         )
         return self
 
-    def plan(self, observation: Observation) -> Plan:
-        """Raises `KeypointError` where the scene cannot be recognised."""
-        if not hasattr(self, "process_"):
-            raise UsageError("call fit(demonstrations) before asking for a plan")
-        located, locating = self.context.locate(observation, self._written)
+    def plan_scene(self, scene: LocatedScene) -> Plan:
         watch = Stopwatch()
         with watch.stage("gaussian process"):
-            mean, deviation = self.process_.predict(located.keypoints.reshape(1, -1))
-        candidate = Trajectory.from_actions(mean.reshape(self._shape))
-        notes = (*self.context.extractor.notes_, *located.notes)
-        plan = robust_plan(Proposal(located, (candidate,), Usage((locating, *watch.stages)), notes))
-        return replace(plan, scale=np.full(self._shape, deviation[0]), confidence=None)
-
-    def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
-        """The prediction."""
-        return (plan.trajectory,)
+            mean, deviation = self.process_.predict(scene.keypoints.reshape(1, -1))
+        proposal = Proposal((Trajectory.from_actions(mean.reshape(self._shape)),), tuple(watch.stages))
+        regression = Stopwatch()
+        with regression.stage("regression"):  # of one candidate: a rigid gripper, open or closed
+            rigid = replace(agree(proposal, self.settings), scale=np.full(self._shape, deviation[0]))
+        return make_plan(self.context_, scene, proposal, rigid, None, regression.stages)

@@ -1,8 +1,10 @@
-"""What a policy is and what it hands over: the protocol, and the `Plan`."""
+"""The protocol of a policy, and its `Plan`."""
 
 from __future__ import annotations
 
 import json
+import math
+import reprlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,8 +18,8 @@ from numpy.typing import NDArray
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
-from robust_instant_policy.files import write_whole
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.files import excerpt, read_json, write_whole
+from robust_instant_policy.geometry import FloatArray, as_numbers
 from robust_instant_policy.trajectory import Trajectory
 
 PLAN_FORMAT = 1  # raised when the layout of plan.json changes
@@ -27,15 +29,14 @@ Progress = Callable[[str, int, int], None]
 
 
 def no_progress(stage: str, done: int, total: int) -> None:
-    """The `Progress` of a caller who does not look."""
+    """The `Progress` of a caller who wants none."""
 
 
 @dataclass(frozen=True)
 class Stage:
     """What one stage of planning cost: wall seconds, and tokens where a language model was asked.
 
-    ``prompt_tokens`` counts what the model was given, ``cached_tokens`` the part of it that it had read before,
-    ``completion_tokens`` what it wrote.
+    ``cached_tokens`` is the part of ``prompt_tokens`` that the server had in its prefix cache.
     """
 
     name: str
@@ -57,7 +58,7 @@ class Usage:
 
     @property
     def tokens(self) -> int:
-        """Tokens the model had to read and write: what it had read before is not counted again."""
+        """Tokens read and written, without cached ones."""
         return sum(stage.prompt_tokens - stage.cached_tokens + stage.completion_tokens for stage in self.stages)
 
 
@@ -78,12 +79,15 @@ class Stopwatch:
 class Plan:
     """A trajectory to execute, and why to trust it.
 
-    ``trajectory`` has T steps; ``candidates`` are the Q trajectories it was made from; ``weights (Q, T)`` in
-    [0, 1] says how much each counted at each step (low = ignored); ``scale (T, 10·A)`` is the spread of the
-    agreement in metres; ``hallucinated (Q,)`` bool names the candidates that left it, ``onset (Q,)`` the first
-    step at which each did (-1: never) and ``scores (Q,)`` how far; ``confidence`` in [0, 1] is the number to
-    gate on, None from a method that has none. ``keypoints (K, 3)``, ``pixels (K, 2)`` and
-    ``keypoint_confidence (K,)`` are what was seen; ``notes`` are remarks for the user, one line each.
+    ``trajectory`` has T steps for A arms; ``candidates`` are the Q trajectories it was made from.
+    ``weights (Q, T)`` in [0, 1] says how much each counted at each step of the plan (low = ignored).
+    ``scale (T, 10·A)`` is the spread of the agreement: in metres for the nine coordinates of an arm's points, and for
+    its gripper state, the tenth column, the weighted share of candidates with the other state, in [0, 1].
+    ``hallucinated (Q,)`` names the candidates that leave the agreement, ``onset (Q,)`` the first step, of the
+    candidate's own, at which each does (-1: never), and ``scores (Q,)`` how strong the evidence is.
+    ``confidence`` in [0, 1] is the number to gate on, None from a method that has none.
+    ``keypoints (K, 3)``, metres, world, ``pixels (K, 2)`` (u, v) and ``keypoint_confidence (K,)`` in [0, 1] are what
+    was recognised; ``notes`` are for the user, one line each.
     """
 
     trajectory: Trajectory
@@ -117,44 +121,73 @@ class Plan:
     def load(cls, path: str | Path) -> Plan:
         """Read a plan written by `save`; raises `DatasetError` in one line."""
         try:
-            content = json.loads(Path(path).read_text(), parse_constant=_no_number)
+            if not Path(path).exists():
+                raise DatasetError(f"no plan at {path}")
+            content = read_json(path, "a plan")
             if content["format"] != PLAN_FORMAT:
-                raise DatasetError(f"{path} has plan format {content['format']}, this version reads {PLAN_FORMAT}")
+                found = reprlib.repr(content["format"])
+                raise DatasetError(f"{path} has plan format {found}, this version reads {PLAN_FORMAT}")
+            trajectory = _from_json(content["trajectory"])
+            candidates = tuple(_from_json(candidate) for candidate in content["candidates"])
+            sizes = {"Q": len(candidates), "T": len(trajectory), "D": trajectory.actions.shape[1]}
+            sizes["K"] = len(content["keypoints"])
             return cls(
-                trajectory=_from_json(content["trajectory"]),
-                candidates=tuple(_from_json(candidate) for candidate in content["candidates"]),
+                trajectory=trajectory,
+                candidates=candidates,
                 confidence=_checked_confidence(content["confidence"]),
-                usage=Usage(tuple(Stage(**stage) for stage in content["usage"])),
-                notes=tuple(content["notes"]),
-                **{name: np.array(content[name], dtype=dtype) for name, dtype in _ARRAYS.items()},
+                usage=Usage(tuple(_stage(stage) for stage in content["usage"])),
+                notes=_checked_notes(content["notes"]),
+                **{name: _array(content, name, sizes) for name in _ARRAYS},
             )
-        except FileNotFoundError:
-            raise DatasetError(f"no plan at {path}") from None
         except OSError as error:
             raise DatasetError(f"{path} cannot be read: {error.strerror}") from None
         except (KeyError, TypeError, ValueError, InvalidValueError) as error:
-            raise DatasetError(f"{path} is not a plan: {error}") from None
+            raise DatasetError(f"{path} is not a plan: {excerpt(error)}") from None
 
 
-_ARRAYS: dict[str, type] = {
-    "weights": np.float64,
-    "scale": np.float64,
-    "hallucinated": np.bool_,
-    "onset": np.int64,
-    "scores": np.float64,
-    "keypoints": np.float64,
-    "pixels": np.float64,
-    "keypoint_confidence": np.float64,
+_ARRAYS: dict[str, tuple[type, str]] = {  # type, and size of each axis: a letter or a number
+    "weights": (np.float64, "QT"),
+    "scale": (np.float64, "TD"),
+    "hallucinated": (np.bool_, "Q"),
+    "onset": (np.int64, "Q"),
+    "scores": (np.float64, "Q"),
+    "keypoints": (np.float64, "K3"),
+    "pixels": (np.float64, "K2"),
+    "keypoint_confidence": (np.float64, "K"),
 }
 
 
-def _no_number(word: str) -> float:
-    raise ValueError(f"it holds {word} in place of a number")
+def _array(content: dict, name: str, sizes: dict[str, int]) -> NDArray:
+    dtype, axes = _ARRAYS[name]
+    shape = tuple(sizes[axis] if axis in sizes else int(axis) for axis in axes)
+    values = as_numbers(name, content[name])
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} holds values that are not finite")
+    if values.shape != shape and values.size + math.prod(shape) > 0:  # an empty array keeps no shape in JSON
+        raise ValueError(f"{name} must be {shape}, got {values.shape}")
+    return values.reshape(shape).astype(dtype)
+
+
+def _stage(content: dict) -> Stage:
+    stage = Stage(**content)
+    if not isinstance(stage.name, str) or not all(
+        isinstance(value, int | float) and 0 <= value < math.inf
+        for name, value in vars(stage).items()
+        if name != "name"
+    ):
+        raise ValueError("its usage holds something other than a name and what a stage cost")
+    return stage
+
+
+def _checked_notes(notes: object) -> tuple[str, ...]:
+    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+        raise ValueError("its notes are not a list of text")
+    return tuple(notes)
 
 
 def _checked_confidence(value: float | None) -> float | None:
     if value is not None and not (isinstance(value, int | float) and 0.0 <= value <= 1.0):
-        raise ValueError(f"its confidence is {value!r}, not a number from 0 to 1")
+        raise ValueError(f"its confidence is {reprlib.repr(value)}, not a number from 0 to 1")
     return value
 
 
@@ -163,16 +196,17 @@ def _to_json(trajectory: Trajectory) -> dict[str, list]:
 
 
 def _from_json(content: dict[str, list]) -> Trajectory:
-    return Trajectory(np.array(content["actions"]), np.array(content["times"]))
+    return Trajectory(as_numbers("actions", content["actions"]), as_numbers("times", content["times"]))
 
 
 class Policy(Protocol):
     """Sees demonstrations once, then plans for new observations."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> Policy:
-        """Take in the demonstrations; returns itself."""
+        """Returns itself."""
         ...
 
     def plan(self, observation: Observation) -> Plan:
@@ -186,7 +220,7 @@ class Policy(Protocol):
 
 @runtime_checkable
 class ClosedLoopPolicy(Protocol):
-    """Sees demonstrations once, then moves the robot itself, looking again as it goes."""
+    """Sees demonstrations once, then moves the robot in closed loop."""
 
     name: str
 
@@ -196,9 +230,9 @@ class ClosedLoopPolicy(Protocol):
         ...
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> ClosedLoopPolicy:
-        """Take in the demonstrations; returns itself."""
+        """Returns itself."""
         ...
 
     def controller(self, observation: Observation) -> Controller:
-        """What moves the robot in the scene of ``observation``, from its start; good for one episode."""
+        """The controller of one episode in the scene of ``observation``."""
         ...

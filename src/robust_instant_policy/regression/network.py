@@ -1,12 +1,11 @@
-"""The paper's own estimator: a mean and a variance network trained on Eq. 2 (Oh et al. 2025, Eq. 1-4 and Table II).
+"""The paper's own estimator: a mean and a scale network trained on Eq. 2 (Oh et al. 2025, Eq. 1-4 and Table II).
 
-Two networks with two hidden layers of 64 map the time to μ(t) and σ(t). What the paper leaves open is chosen here and
-in the plainest way: ReLU between the layers, a softplus for σ, and data standardised by dimension before the fit.
+Two networks with two hidden layers of 64 map the time to μ(t) and σ(t). The paper leaves open the activation (here
+ReLU), the output of the variance network (softplus) and the scaling of the data (standardised by dimension).
 
-`StudentTNetwork` can be trained in two ways that minimise the same loss over the same networks: as the paper does, by
-Adam on mini-batches with the step count of Table II, or faster, because there are few samples and no noise but the
-batches' own: in full batches, first by Adam and then by L-BFGS, a quasi-Newton method, from a start at which the kinks
-of the first layer are spread over the trajectory instead of lying mostly outside of it.
+Two ways of training minimise the same loss over the same networks: the paper's, Adam on mini-batches with the step
+count of Table II; and a faster one, full batches with Adam and then L-BFGS, from a start at which the kinks of the
+first layer are spread over the trajectory.
 """
 
 from __future__ import annotations
@@ -14,28 +13,31 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from numbers import Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import gammaln
 
-from robust_instant_policy.errors import InvalidValueError, MissingExtraError, UnknownNameError
+from robust_instant_policy.checks import checked_array, checked_positive, checked_whole
+from robust_instant_policy.errors import InvalidValueError, MissingExtraError, UnknownNameError, UsageError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.regression.alignment import Candidates, checked_dof
-from robust_instant_policy.regression.diagnosis import effective_count
-from robust_instant_policy.regression.student_t import DEFAULT_DOF, expected_precision
+from robust_instant_policy.regression.candidates import Candidates
+from robust_instant_policy.regression.em import DEFAULT_DOF, expected_precision
+from robust_instant_policy.regression.likelihood import effective_count
 
-HIDDEN = (64, 64)
-BATCH = 64
-SCALE_FLOOR = 1e-3  # of a dimension's standard deviation: keeps the loss finite where candidates coincide
-WARM_STEPS = 2000  # of Adam in full batches, which finds the basin,
-WARM_RATE = 1e-2
-QUASI_NEWTON_STEPS = 1000  # and at most so many of L-BFGS, which gets to its bottom
-QUASI_NEWTON_CHUNK = 50  # steps between looks at the loss
+HIDDEN = (64, 64)  # units, Table II
+BATCH = 64  # samples, Table II
+SCALE_FLOOR = 1e-3  # standard deviations of a dimension: keeps the loss finite where candidates coincide
+WARM_STEPS = 2000  # of Adam in full batches
+WARM_RATE = 1e-2  # learning rate of these
+QUASI_NEWTON_STEPS = 1000  # of L-BFGS afterwards, at most
+QUASI_NEWTON_CHUNK = 50  # steps between checks of the loss
 QUASI_NEWTON_GAIN = 2e-3  # loss gained in a chunk below which training ends
-QUASI_NEWTON_MEMORY = 20  # past steps that the curvature is taken from
-FIRST_SLOPES = (2.0, 6.0)  # of the first layer at the fast start: a kink is felt over a fraction of the trajectory
+QUASI_NEWTON_MEMORY = 20  # past steps that L-BFGS keeps
+FIRST_SLOPES = (2.0, 6.0)  # of the first layer at the fast start: a kink acts over a fraction of the trajectory
+MAX_SEED = 2**63  # torch's generator takes no more
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class StudentTNetwork:
 
     ``recipe`` is "sim" or "real", the columns of the paper's Table II, trained exactly as there; or "fast", the same
     networks and loss with better steps. ``seed`` fixes initial parameters and batches. ``target`` stops the
-    training as soon as the loss over all samples reaches it (looked at every hundred steps).
+    training as soon as the loss over all samples reaches it (checked every hundred steps).
 
     After `fit`: ``loss``, the mean of Eq. 2 over all numbers at the end; ``num_iterations``; ``weights``; ``knots``.
     Needs the extra "train" (torch).
@@ -63,8 +65,10 @@ class StudentTNetwork:
     def __init__(self, dof: float = DEFAULT_DOF, recipe: str = "fast", seed: int = 0, target: float | None = None):
         if recipe not in (*RECIPES, "fast"):
             raise UnknownNameError("recipe", recipe, (*RECIPES, "fast"))
-        self.dof = checked_dof(dof)
-        self.recipe, self.seed, self.target = recipe, seed, target
+        if target is not None and (isinstance(target, bool) or not isinstance(target, Real) or np.isnan(target)):
+            raise InvalidValueError(f"target must be a number or None, got {target!r} ({type(target).__name__})")
+        self.dof = checked_positive("dof", dof, infinite=True)
+        self.recipe, self.seed, self.target = recipe, checked_whole("seed", seed), target
 
     def fit(self, candidates: Sequence[ArrayLike], times: Sequence[ArrayLike] | None = None) -> StudentTNetwork:
         """Fit to ``candidates``, each ``(T_q, D)``, at ``times``, each ``(T_q,)`` in [0, 1] (evenly spread if None)."""
@@ -74,13 +78,12 @@ class StudentTNetwork:
         self._center = data.values.mean(axis=0)
         unit = data.values.std(axis=0)
         self._unit = np.where(unit > 0, unit, 1.0)
-        self._dimension = data.num_dimensions
         inputs = torch.tensor(data.times[:, None], dtype=torch.float32)
         targets = torch.tensor((data.values - self._center) / self._unit, dtype=torch.float32)
-        generator = torch.Generator().manual_seed(self.seed)
+        generator = torch.Generator().manual_seed(self.seed % MAX_SEED)
         self._networks = [_network(torch, data.num_dimensions, generator) for _ in range(2)]
         threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # more of them only wait for each other on networks this small
+        torch.set_num_threads(1)  # networks this small are slower on several threads
         try:
             if self.recipe == "fast":
                 self.num_iterations = self._train_fast(inputs, targets, generator)
@@ -99,24 +102,28 @@ class StudentTNetwork:
 
     def mean(self, times: ArrayLike | None = None) -> FloatArray:
         """The robust trajectory μ ``(T, D)`` at ``times (T,)``, by default at the knots (Oh et al. 2025, Eq. 4)."""
-        return self._evaluate(lambda inputs: self._networks[0](inputs), times) * self._unit + self._center
+        values = self._evaluate(lambda inputs: self._networks[0](inputs), times)
+        return values * self._unit + self._center
 
     def scale(self, times: ArrayLike | None = None) -> FloatArray:
         """The scale σ ``(T, D)`` of trustworthy candidates about the mean at ``times (T,)``."""
-        return self._evaluate(self._scale, times) * self._unit
+        values = self._evaluate(self._scale, times)
+        return values * self._unit
 
     def standard_error(self, times: ArrayLike | None = None) -> FloatArray:
         """How far ``(T, D)`` the mean may be off: the scale over the root of the candidates that decide it."""
-        at = self.knots if times is None else np.asarray(times, dtype=np.float64)
+        at = self._at(times)
         if len(self.weights) == 1:
-            return np.full((len(at), self._dimension), np.inf)
+            return np.full((len(at), len(self._unit)), np.inf)
         return self.scale(at) / np.sqrt(np.interp(at, self.knots, self._deciding))[:, None]
 
+    def _at(self, times: ArrayLike | None) -> FloatArray:
+        if not hasattr(self, "knots"):
+            raise UsageError("nothing is fitted yet; call fit(candidates) first")
+        return self.knots if times is None else checked_array("times", times, "(T,)")
+
     def _evaluate(self, function: Callable[[Any], Any], times: ArrayLike | None) -> FloatArray:
-        torch = _torch()
-        at = self.knots if times is None else np.asarray(times, dtype=np.float64)
-        if at.ndim != 1 or not np.isfinite(at).all():
-            raise InvalidValueError(f"times must be (T,) and finite, got shape {at.shape}")
+        torch, at = _torch(), self._at(times)
         with torch.no_grad():
             return function(torch.tensor(at[:, None], dtype=torch.float32)).numpy().astype(np.float64)
 
@@ -124,7 +131,7 @@ class StudentTNetwork:
         return _torch().nn.functional.softplus(self._networks[1](inputs)) + SCALE_FLOOR
 
     def _loss(self, inputs: Any, targets: Any) -> Any:
-        """Mean negative log-likelihood of a number (Oh et al. 2025, Eq. 2, over its count)."""
+        """-log S of Eq. 1, mean over all numbers: Eq. 2 over its count (see `em.log_density`)."""
         scale = self._scale(inputs)
         squares = ((targets - self._networks[0](inputs)) / scale) ** 2
         if np.isinf(self.dof):
@@ -194,7 +201,7 @@ class StudentTNetwork:
 
 
 def _network(torch: Any, outputs: int, generator: Any) -> Any:
-    """Time to ``outputs``, initialised as torch does but from ``generator``, so that no global seed is touched."""
+    """Network from time to ``outputs``, initialised as torch does but from ``generator``, not from the global seed."""
     widths = (1, *HIDDEN, outputs)
     layers: list[Any] = []
     for inward, outward in pairwise(widths):
@@ -207,7 +214,7 @@ def _network(torch: Any, outputs: int, generator: Any) -> Any:
 
 
 def _spread_kinks(torch: Any, layer: Any, generator: Any) -> None:
-    """Place where each unit of the first layer switches on, evenly at random, within [0, 1]."""
+    """Draw the time at which each unit of the first layer switches on uniformly from [0, 1]."""
     slopes = torch.empty(len(layer.bias)).uniform_(*FIRST_SLOPES, generator=generator)
     with torch.no_grad():
         layer.weight.copy_((torch.sign(layer.weight[:, 0]) * slopes)[:, None])

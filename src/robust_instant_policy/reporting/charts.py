@@ -16,6 +16,7 @@ MM = 1000.0
 AXIS_STEPS = 6  # gripper axes drawn along the robust trajectory
 AXIS_LENGTH_M = 0.03
 AXES = (("#d62728", "gripper x"), ("#2ca02c", "gripper y (opening)"), ("#1f77b4", "gripper z (approach)"))
+CAMERA = {"eye": {"x": 1.5, "y": -1.6, "z": 1.2}, "center": {"x": 0, "y": 0, "z": -0.2}}  # shows all of it
 COLUMNS = 3  # of charts side by side
 WEIGHT_COLOURS = "Viridis_r"  # dark: followed, pale: ignored
 ROBUST_COLOUR = "#111111"
@@ -83,7 +84,7 @@ def paths_in_space(plan: Plan) -> go.Figure:
         height=620,
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
         legend={"x": 0, "y": 1},
-        scene={"aspectmode": "data", "camera": {"eye": {"x": 1.3, "y": -1.5, "z": 1.1}}, **axes},
+        scene={"aspectmode": "data", "camera": CAMERA, **axes},
     )
     return figure
 
@@ -131,7 +132,7 @@ def weights_over_time(plan: Plan) -> go.Figure:
         )
     )  # fmt: skip
     figure.update_layout(
-        height=110 + 26 * len(names), margin={"l": 10, "r": 10, "t": 10, "b": 45}, template="simple_white"
+        height=140 + 26 * len(names), margin={"l": 10, "r": 10, "t": 40, "b": 45}, template="simple_white"
     )
     figure.update_xaxes(title_text="step of the robust trajectory")
     figure.update_yaxes(autorange="reversed", automargin=True)

@@ -1,4 +1,4 @@
-"""The paper's figures, drawn from rows: readable in grey, every axis with its unit."""
+"""The paper's figures, drawn from rows: readable in greyscale, every axis with its unit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from robust_instant_policy.evaluation import paper
-from robust_instant_policy.evaluation.summary import Summary
+from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.evaluation.variant import Scene, Variant, by_demos, labels, values
 from robust_instant_policy.policies import Plan
 
@@ -43,7 +43,7 @@ PARAMETERS = {
 
 @dataclass(frozen=True)
 class Style:
-    """How a method looks: by brightness, hatch, marker and line, so that colour is not needed to tell it."""
+    """How a method is drawn: brightness, hatch, marker and line differ, so that colour is not needed."""
 
     colour: str
     hatch: str
@@ -220,7 +220,7 @@ def _downsampling(summary: Summary) -> Figure:
 
 
 def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan]) -> Figure:
-    """Palm position over time in the scene in which RIP and the Gaussian part the most (Oh et al. 2025, Fig. 4a)."""
+    """Gripper point over time where RIP and the Gaussian average differ most (Oh et al. 2025, Fig. 4a)."""
     figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
     by_scene: dict[Scene, dict[str, Plan]] = {}
     for (scene, variant), plan in plans.items():
@@ -230,7 +230,7 @@ def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan])
         figure.text(0.5, 0.5, "no scene has been planned by both rip and rip-gauss yet", ha="center")
         return figure
     panels = figure.subplots(1, 3, sharex=True)
-    scene = max(whole, key=lambda one: _worth_showing(whole[one]["rip"], whole[one]["rip-gauss"]))
+    scene = max(whole, key=lambda one: _difference(whole[one]["rip"], whole[one]["rip-gauss"]))
     robust, gauss = whole[scene]["rip"], whole[scene]["rip-gauss"]
     for axis, panel in enumerate(panels):
         for candidate, hallucinated in zip(robust.candidates, robust.hallucinated, strict=True):
@@ -255,8 +255,8 @@ def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan])
     return figure
 
 
-def _worth_showing(robust: Plan, gauss: Plan) -> tuple[bool, float]:
-    """Whether a candidate is hallucinated, and how far it pulls the Gaussian away, in metres."""
+def _difference(robust: Plan, gauss: Plan) -> tuple[bool, float]:
+    """Whether a candidate is hallucinated, and the largest distance between RIP and the Gaussian average, in metres."""
     times = np.linspace(0.0, 1.0, 50)
     points = [plan.trajectory.resampled(times).actions[:, :3] for plan in (robust, gauss)]
     return bool(robust.hallucinated.any()), float(np.linalg.norm(points[0] - points[1], axis=1).max())

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.evaluation.episodes import open_episodes
-from robust_instant_policy.evaluation.experiment import TRAINING_FOLDER, plan_file, wanted_plans
-from robust_instant_policy.evaluation.failures import open_failures
-from robust_instant_policy.evaluation.manifest import Manifest
-from robust_instant_policy.evaluation.suites import CHOSEN, Suite
-from robust_instant_policy.evaluation.summary import Summary
+from robust_instant_policy.evaluation.experiment import TRAINING_FOLDER, plan_file
+from robust_instant_policy.evaluation.statistics import Summary
+from robust_instant_policy.evaluation.store import read_results
+from robust_instant_policy.evaluation.suites import CHOSEN
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.policies import Plan
@@ -32,10 +30,10 @@ def publish(out: Path) -> str:
 
     Raises `DatasetError` where nothing has been executed yet.
     """
-    episodes, failures = open_episodes(out).rows, open_failures(out).rows
+    results = read_results(out)
+    episodes, failures, manifest = results.episodes, results.failures, results.manifest
     if not episodes:
         raise DatasetError(f"{out} holds no executions yet; run rip eval --out {out} first")
-    manifest = Manifest.read(out)
     summaries = [Summary(suite, episodes) for suite in manifest.suites]
     of_paper = {row.key for summary in summaries if summary.suite.name != CHOSEN for row in summary.rows}
     shown = [
@@ -60,7 +58,7 @@ def publish(out: Path) -> str:
 def _publish_suite(out: Path, summary: Summary) -> Section:
     suite = summary.suite
     kinds = tuple(kind for kind, usual in ((suite.objects, "seen"), (suite.assets, "code")) if kind != usual)
-    figure = draw(summary, _kept_plans(out, suite))
+    figure = draw(summary, _kept_plans(out, summary))
     drawing = encode(figure, "svg")
     section = Section(suite.name, kinds, drawing, tables(summary))
     stem = section.anchor
@@ -75,8 +73,8 @@ def _text(shown: Sequence[Table]) -> str:
     return "\n".join(table.markdown() for table in shown)
 
 
-def _kept_plans(out: Path, suite: Suite) -> dict[tuple[Scene, Variant], Plan]:
-    if not suite.keeps_plans:
+def _kept_plans(out: Path, summary: Summary) -> dict[tuple[Scene, Variant], Plan]:
+    if not summary.suite.keeps_plans:
         return {}
-    files = {plan: out / plan_file(*plan) for plan in wanted_plans([suite])}
-    return {plan: Plan.load(path) for plan, path in files.items() if path.exists()}
+    files = {row.trial: out / plan_file(*row.trial) for row in summary.rows}
+    return {trial: Plan.load(path) for trial, path in files.items() if path.exists()}

@@ -168,7 +168,7 @@ def _candidates_over_scene(observation: Observation, plan: Plan) -> Picture:
     for index, candidate in enumerate(plan.candidates):
         dash = f"{2 * unit:.2f}" if plan.hallucinated[index] else ""
         drawn += lines(candidate, candidate_colour(plan, index), 1.1, dash, candidate_name(plan, index))
-    return picture(observation.rgb, "New scene with the candidates and, black, the trajectory that was planned", drawn)
+    return picture(observation.rgb, "new scene with the candidates and, black, the trajectory that was planned", drawn)
 
 
 def _keypoint_table(plan: Plan) -> Table:

@@ -1,4 +1,4 @@
-"""The paper's tables, with intervals and tests that it lacks."""
+"""The paper's tables, with confidence intervals and significance tests."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import STAGES, Failure
 from robust_instant_policy.evaluation.manifest import Invocation
-from robust_instant_policy.evaluation.statistics import mark, paired_test, t_test
-from robust_instant_policy.evaluation.summary import Rate, Summary, reference
+from robust_instant_policy.evaluation.statistics import Rate, Summary, mark, paired_test, reference, t_test
 from robust_instant_policy.evaluation.variant import Variant, by_demos, labels, values
 from robust_instant_policy.policies import METHOD_NAMES
 
@@ -140,7 +139,7 @@ def demos_table(summary: Summary) -> Table:
 
 
 def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> Table:
-    """How the failed episodes of each method share out over the stages that lost them."""
+    """How many failures of each method each stage caused."""
     keys = {row.key for row in episodes}
     known = [failure for failure in failures if failure.key in keys]
     methods = sorted({row.variant.method for row in episodes}, key=METHOD_NAMES.index)
@@ -168,7 +167,7 @@ def invocation_table(invocations: Sequence[Invocation], episodes: Sequence[Episo
     for one in invocations:
         rows.setdefault((one.command, one.machine, one.code), []).append(one.hours)
     models = sorted({row.variant.model for row in episodes if row.variant.model})
-    shared: dict[tuple, float] = {}  # methods that share samples all count the time it took to get them
+    shared: dict[tuple, float] = {}  # methods that share samples each count the time of sampling
     for row in episodes:
         samples = row.scene, row.variant.demos, row.variant.downsampling, row.variant.frames, row.variant.layout
         shared[samples] = max(shared.get(samples, 0.0), row.seconds)

@@ -1,10 +1,8 @@
-"""How a person picks something up from the table, and in which words that fails: the same for every arm."""
+"""Picking an object up from the table with any arm: the strokes, and why it failed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -41,10 +39,10 @@ class Pick:
         ]
 
 
-def failure_of_pick(state: Mapping[str, Any], what: str) -> str:
-    """Why ``what`` was not picked, or nothing, by the "success", "lifted" and "held" of an environment's evaluation."""
-    if bool(state["success"]):
-        return ""
-    if not bool(state["held"]):
-        return f"the {what} slipped out of the fingers" if bool(state["lifted"]) else f"the fingers hold no {what}"
-    return f"the {what} is held but still moving" if bool(state["lifted"]) else f"the {what} was not lifted"
+def failure_of_pick(what: str, lifted: bool, held: bool, still: bool) -> str:
+    """Why ``what`` was not picked, in words; nothing where it is held ``still`` above the table."""
+    if not held:
+        return f"the {what} slipped out of the fingers" if lifted else f"the fingers hold no {what}"
+    if not lifted:
+        return f"the {what} was not lifted"
+    return "" if still else f"the {what} is held but still moving"

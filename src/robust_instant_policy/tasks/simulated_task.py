@@ -17,23 +17,22 @@ from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.waypoints import plan_onward, plan_poses, plan_waypoints
 from robust_instant_policy.tasks.demonstrator import Stroke, perform
 from robust_instant_policy.tasks.scene_truth import SceneTruth
-from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image
+from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image, bounded_seed
 from robust_instant_policy.trajectory import Trajectory
 
 HAND_STREAM = 1  # the demonstrator's random numbers, apart from the scene's
+SEED_BITS = 32  # that the simulators take
 SETTLE_SECONDS = 0.5  # at rest before a demonstration is judged
 
 Expert = Callable[[Any, np.random.Generator], Sequence[Stroke]]
-Verdict = Callable[[Any], str]
 
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """What makes a task: its environment, what the person does in it, and why it failed, in words.
+    """What makes a task: its environment, and the expert that demonstrates it.
 
-    ``expert(env, rng)`` sees the simulator's state, as a person sees the scene; ``verdict(env)`` returns the
-    reason of failure, or nothing after success. ``object_sets`` and ``asset_sources`` are what there is to
-    choose from.
+    ``expert(env, rng)`` sees the simulator's state, as a person sees the scene. ``object_sets`` and ``asset_sources``
+    are the choices that there are.
     """
 
     name: str
@@ -41,7 +40,6 @@ class TaskSpec:
     goal: str
     env_id: str
     expert: Expert
-    verdict: Verdict
     object_sets: tuple[str, ...] = ("seen",)
     asset_sources: tuple[str, ...] = ("code",)
 
@@ -50,7 +48,8 @@ class Cell(Protocol):
     """A gymnasium environment that holds a scene with A arms; see the methods of the same names in `Task`.
 
     ``advance`` takes one control step towards ``command (A·(J + 1),)``: of one arm after the other the joint angles
-    and the finger travel, rad and m. ``tool_poses`` is where the arms' tool frames are, ``(A, 4, 4)``.
+    and the finger travel, rad and m. ``tool_poses`` is where the arms' tool frames are, ``(A, 4, 4)``. ``failure`` says
+    why the task is not done, in words, and nothing once it is.
     """
 
     def reset(self, *, seed: int) -> Any: ...
@@ -59,6 +58,7 @@ class Cell(Protocol):
     def advance(self, command: FloatArray) -> None: ...
     def tool_poses(self) -> FloatArray: ...
     def video_frame(self) -> np.ndarray: ...
+    def failure(self) -> str: ...
     def close(self) -> None: ...
 
 
@@ -105,7 +105,7 @@ class SimulatedTask:
         control_hz = self._timing.control_hz
         motion = plan_waypoints(trajectory, self._arms, self.execute_hz, control_hz)
         tracking_error = self._play(motion, self._filming(on_frame))
-        failure = self._spec.verdict(self._cell)
+        failure = self._cell.failure()
         return Execution(not failure, failure, len(motion.joints) / control_hz, tracking_error)
 
     def follow(self, controller: Controller, max_seconds: float, on_frame: FrameSink | None = None) -> Execution:
@@ -129,7 +129,7 @@ class SimulatedTask:
                 worst = max(worst, self._play(motion, before_step))
                 steps += len(motion.joints)
         self._rest(motion)
-        failure = failure or self._spec.verdict(self._cell)
+        failure = failure or self._cell.failure()
         return Execution(not failure, failure, steps / control_hz, worst)
 
     def demonstrate(self, seed: int, with_images: bool = False, every: int = 1) -> Attempt:
@@ -147,7 +147,7 @@ class SimulatedTask:
             poses, closed = motion.poses, motion.closed
             self._play(motion, self._photographing(images, self._recorded(poses, every)) if with_images else _nothing)
             self._rest(motion)
-            failure = self._spec.verdict(self._cell)
+            failure = self._cell.failure()
         recorded = self._recorded(poses, every)
         trajectory = Trajectory.from_poses(poses[recorded], closed[recorded], self._triangle)
         demonstration = Demonstration(observation, trajectory, self.record_hz / every, self.name, seed)
@@ -161,7 +161,7 @@ class SimulatedTask:
         self._cell.close()
 
     def _rebuild(self, seed: int) -> None:
-        self._cell.reset(seed=seed)
+        self._cell.reset(seed=bounded_seed(seed, SEED_BITS))
         self._seed, self._fresh = seed, True
 
     def _recorded(self, poses: FloatArray, every: int) -> range:

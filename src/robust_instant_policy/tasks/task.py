@@ -19,6 +19,13 @@ Image = NDArray[np.uint8]
 FrameSink = Callable[[Image], None]
 
 
+def bounded_seed(seed: int, bits: int) -> int:
+    """``seed`` where it fits into ``bits`` bits, else a number of up to 64 of them that is drawn with it."""
+    if seed < 1 << bits:
+        return seed
+    return int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]) >> (64 - bits)
+
+
 @dataclass(frozen=True)
 class Execution:
     """What happened when a trajectory was executed.

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.importers.hdf5 import open_hdf5
+from robust_instant_policy.datasets.importers.hdf5 import members, open_hdf5
 from robust_instant_policy.datasets.importers.lerobot import read_lerobot
 from robust_instant_policy.datasets.importers.maniskill import read_maniskill
 from robust_instant_policy.datasets.importers.robomimic import read_robomimic
@@ -80,10 +80,11 @@ def _open(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
             return read_lerobot(path, rig.camera, rig.depth_key, rig.depth_unit_m)
     else:
         with open_hdf5(path) as file:
-            names = set(file)
+            names = set(members(file, "/"))
+            robomimic = bool(members(file, "data"))
         if path.with_suffix(".json").exists() and any(name.startswith("traj_") for name in names):
             return read_maniskill(path, rig.camera)
-        if "data" in names:
+        if robomimic:
             return read_robomimic(path, rig.camera)
     raise DatasetError(
         f"{path} is none of the recordings that can be imported: a ManiSkill trajectory (NAME.h5 beside NAME.json), "

@@ -1,34 +1,108 @@
-"""HDF5 files, opened with errors in one line."""
+"""HDF5 files of others, opened with errors in one line, and read without leaving the file."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from robust_instant_policy.errors import DatasetError, MissingExtraError
+from robust_instant_policy.files import excerpt, open_regular
+
+MAX_ARRAY_BYTES = 2**32  # of one array; the images of an episode are the largest
 
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Any]:
-    """The open ``h5py.File``. Raises `DatasetError` for one that is missing or damaged, also while it is read."""
+    """The open ``h5py.File``. Raises `DatasetError` for one that is missing or damaged, also while it is read, and for
+    one with links: an external link leads to another file.
+    """
     try:
         import h5py
     except ImportError as error:
         raise MissingExtraError("h5py", "import") from error
-    if not path.exists():
-        raise DatasetError(f"there is no file {path}")
     try:
+        open_regular(path).close()
         with h5py.File(path, "r") as file:
+            link = file.visititems_links(lambda name, link: None if isinstance(link, h5py.HardLink) else name)
+            if link is not None:
+                raise DatasetError(
+                    f"{path}: {excerpt(link)!r} is a link in place of content; copy the file with its links resolved"
+                )
             yield file
-    except OSError as error:
-        raise DatasetError(f"{path} is damaged or not an HDF5 file: {error}") from error
+    except FileNotFoundError:
+        raise DatasetError(f"there is no file {path}") from None
+    except (OSError, RuntimeError, KeyError) as error:  # of h5py, for damage in any place of the file
+        raise DatasetError(f"{path} is damaged or not an HDF5 file: {excerpt(error)}") from error
 
 
-def read(group: Any, name: str) -> Any:
-    """The array ``name`` of a group, or None where there is none."""
-    return group[name][()] if name in group else None
+def has(group: Any, name: str) -> bool:
+    """Whether a group holds ``name``, a path within the file."""
+    import h5py
+
+    return isinstance(group, h5py.Group) and name in group
+
+
+def read(group: Any, name: str, ndim: int) -> NDArray | None:
+    """The array ``name`` of numbers of a group, or None where there is none.
+
+    Raises `DatasetError` for one of other dimensions, without content, of another type, or too large, and for one
+    that is stored in another file.
+    """
+    import h5py
+
+    if not has(group, name):
+        return None
+    data = group[name]
+    where = f"{group.file.filename}: {group.name}/{name}"
+    if not isinstance(data, h5py.Dataset) or data.dtype.kind not in "biuf":
+        raise DatasetError(f"{where} is not an array of numbers")
+    if data.is_virtual or data.external:
+        raise DatasetError(f"{where} is stored in another file; copy its content into this one")
+    if data.ndim != ndim or not data.size:
+        raise DatasetError(f"{where} must have {ndim} dimensions and not be empty, got {data.shape}")
+    if data.nbytes > MAX_ARRAY_BYTES:
+        raise DatasetError(f"{where} is larger than {MAX_ARRAY_BYTES >> 30} GiB, its header says {data.shape}")
+    return data[()]
+
+
+def members(group: Any, name: str) -> list[str]:
+    """Names in the group ``name`` of a group; none where there is no such group."""
+    import h5py
+
+    inner = group[name] if has(group, name) else None
+    return list(inner) if isinstance(inner, h5py.Group) else []
+
+
+def read_json_attribute(group: Any, name: str) -> dict[str, Any]:
+    """The JSON object in an attribute, empty where there is none. Raises `DatasetError` for anything else."""
+    where = f"{group.file.filename}: the attribute {name} of {group.name}"
+    try:
+        text = group.attrs.get(name, "{}")
+        content = json.loads(text) if isinstance(text, str | bytes) else None
+    except (ValueError, TypeError, RecursionError, OSError) as error:
+        raise DatasetError(f"{where} is not JSON") from error
+    if not isinstance(content, dict):
+        raise DatasetError(f"{where} is not a JSON object")
+    return content
+
+
+def nested(content: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """The JSON object that ``names`` lead to, one in the other; empty where there is none."""
+    inner: Any = content
+    for name in names:
+        inner = inner.get(name) if isinstance(inner, Mapping) else None
+    return inner if isinstance(inner, dict) else {}
+
+
+def first_matrix(array: NDArray | None) -> NDArray[np.float64] | None:
+    """The first of some matrices ``(T, …)``, as float64."""
+    return None if array is None else array[0].astype(np.float64)
 
 
 def choose_camera(path: Path, cameras: Sequence[str], wanted: str | None) -> str | None:

@@ -7,7 +7,6 @@ kinematics write it: ``ee.x … ee.wz, ee.gripper_pos``) or qx, qy, qz, qw, what
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -15,16 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
-from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.datasets import layout
 from robust_instant_policy.datasets.folder import Folder, open_folder
+from robust_instant_policy.datasets.images import decode_image
 from robust_instant_policy.datasets.importers.hdf5 import choose_camera
-from robust_instant_policy.datasets.importers.source import SourceEpisode
+from robust_instant_policy.datasets.importers.source import SourceEpisode, poses_of
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.files import excerpt
+from robust_instant_policy.geometry import FloatArray, as_numbers
 
 AXIS = re.compile(r"(?:.*[._ ])?(x|y|z|wx|wy|wz|qx|qy|qz|qw)$")
 POSITION, ROTATION_VECTOR, QUATERNION = ("x", "y", "z"), ("wx", "wy", "wz"), ("qx", "qy", "qz", "qw")
@@ -56,8 +56,8 @@ def read_lerobot(
         poses, gripper = _poses_and_gripper(folder, episode)
         depth = None
         if depth_key is not None and depth_unit_m is not None:
-            first = _first_image(folder, episode, depth_key).astype(np.float32)
-            depth = first.reshape(first.shape[:2]) * np.float32(depth_unit_m)
+            depth = _first_image(folder, episode, depth_key).astype(np.float32) * np.float32(depth_unit_m)
+            depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
         yield SourceEpisode(
             name=f"{path} (episode {episode})",
             rgb=None if chosen is None else _first_image(folder, episode, chosen),
@@ -69,10 +69,14 @@ def read_lerobot(
             info={
                 "source": path.name,
                 "episode": episode,
-                "description": "; ".join(folder.episodes[episode].get("tasks", [])),
+                "description": _description(folder.episodes[episode].get("tasks")),
             },
             advice=ADVICE if poses is None or depth is None else "",
         )
+
+
+def _description(tasks: object) -> str:
+    return "; ".join(str(task) for task in tasks) if isinstance(tasks, list) else ""
 
 
 def _poses_and_gripper(folder: Folder, episode: int) -> tuple[FloatArray | None, FloatArray | None]:
@@ -83,12 +87,12 @@ def _poses_and_gripper(folder: Folder, episode: int) -> tuple[FloatArray | None,
         names = _axis_names(folder.info["features"][key])
         axes = _pose_axes(names)
         grippers = [column for column, name in enumerate(names) if "gripper" in name.lower()]
-        values = np.array(folder.columns(episode, [key])[key].to_pylist(), dtype=np.float64)
+        values = folder.matrix(episode, key)
+        if names and values.shape[1] != len(names):
+            raise DatasetError(f"{folder.root}: {key} has {values.shape[1]} numbers a frame and {len(names)} names")
         if poses is None and axes is not None:
-            poses = np.tile(np.eye(4), (len(values), 1, 1))
-            poses[:, :3, 3] = values[:, axes[:3]]
-            turn = Rotation.from_rotvec if len(axes) == 6 else Rotation.from_quat
-            poses[:, :3, :3] = turn(values[:, axes[3:]]).as_matrix()
+            name = f"{folder.root} (episode {episode})"
+            poses = poses_of(name, values[:, axes], range(3, len(axes)))
         if gripper is None and len(grippers) == 1:
             gripper = values[:, grippers[0]]
     return poses, gripper
@@ -99,7 +103,7 @@ def _axis_names(feature: Mapping[str, Any]) -> list[str]:
     names = feature.get("names") or []
     if isinstance(names, Mapping):
         names = [name for group in names.values() if isinstance(group, list) for name in group]
-    return [str(name) for name in names]
+    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
 
 
 def _pose_axes(names: Sequence[str]) -> list[int] | None:
@@ -123,11 +127,14 @@ def _first_image(folder: Folder, episode: int, key: str) -> NDArray:
     """The first frame of an image feature: from a video, from stored image files, or from numbers."""
     if key in folder.video_keys:
         return next(folder.frames(episode, key))
-    value = folder.columns(episode, [key])[key][0].as_py()
-    if not isinstance(value, Mapping):
-        return np.array(value)
     try:
-        with Image.open(io.BytesIO(value["bytes"])) as image:
-            return np.asarray(image)
-    except (OSError, TypeError, KeyError, SyntaxError) as error:
-        raise DatasetError(f"{folder.root}: episode {episode} has no readable image {key!r}") from error
+        value = folder.columns(episode, [key])[key][0].as_py()
+        if not isinstance(value, Mapping):
+            return as_numbers(key, value, np.float32)
+        if not isinstance(value.get("bytes"), bytes):
+            raise ValueError("its images are not stored in the table")
+        return np.asarray(decode_image(value["bytes"], ("PNG", "JPEG", "TIFF")))
+    except (ValueError, OverflowError, pa.ArrowException) as error:
+        raise DatasetError(
+            f"{folder.root}: episode {episode} has no readable image {excerpt(key)!r} ({excerpt(error)})"
+        ) from error

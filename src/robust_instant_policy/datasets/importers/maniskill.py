@@ -12,13 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.datasets.folder import read_json
-from robust_instant_policy.datasets.importers.hdf5 import choose_camera, open_hdf5, read
-from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode
+from robust_instant_policy.datasets.importers.hdf5 import (
+    choose_camera,
+    first_matrix,
+    has,
+    members,
+    nested,
+    open_hdf5,
+    read,
+)
+from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode, poses_of
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.geometry import FloatArray, invert_pose
+from robust_instant_policy.files import read_json
+from robust_instant_policy.geometry import invert_pose
 
 MILLIMETRE = 1e-3
 # ManiSkill's Panda: the last action runs from -1 (closed) to 1 (open), and its tcp is the tool frame of `geometry`.
@@ -33,15 +40,17 @@ ADVICE = (
 def read_maniskill(path: Path, camera: str | None) -> Iterator[SourceEpisode]:
     """The successful episodes of a trajectory file. Raises `DatasetError` when there are none."""
     description = read_json(path.with_suffix(".json"))
-    kwargs = description.get("env_info", {}).get("env_kwargs", {})
+    kwargs = nested(description, "env_info", "env_kwargs")
     episodes = description.get("episodes", [])
+    if not isinstance(episodes, list) or not all(isinstance(episode, dict) for episode in episodes):
+        raise DatasetError(f"{path.with_suffix('.json')} must list its episodes as objects")
     successful = [episode for episode in episodes if episode.get("success", True)]
     if not successful:
         raise DatasetError(f"{path} holds {len(episodes)} episodes, none of them successful")
     with open_hdf5(path) as file:
         for episode in successful:
-            name = f"traj_{episode['episode_id']}"
-            if name not in file:
+            name = f"traj_{episode.get('episode_id')}"
+            if not has(file, name):
                 raise DatasetError(f"{path} has no {name}, which its .json lists")
             yield _read_episode(path, name, file[name], camera, episode, kwargs)
 
@@ -49,26 +58,27 @@ def read_maniskill(path: Path, camera: str | None) -> Iterator[SourceEpisode]:
 def _read_episode(
     path: Path, name: str, group: Any, camera: str | None, episode: Mapping[str, Any], kwargs: Mapping[str, Any]
 ) -> SourceEpisode:
-    cameras = list(group["obs/sensor_data"]) if "obs/sensor_data" in group else []
-    chosen = choose_camera(path, cameras, camera)
-    images, depth = (read(group, f"obs/sensor_data/{chosen}/{kind}") for kind in ("rgb", "depth"))
-    intrinsics = read(group, f"obs/sensor_param/{chosen}/intrinsic_cv")
-    extrinsics = read(group, f"obs/sensor_param/{chosen}/extrinsic_cv")
-    tcp = read(group, "obs/extra/tcp_pose")
-    actions = read(group, "actions")
+    chosen = choose_camera(path, members(group, "obs/sensor_data"), camera)
+    images, depth = (read(group, f"obs/sensor_data/{chosen}/{kind}", ndim=4) for kind in ("rgb", "depth"))
+    intrinsics = first_matrix(read(group, f"obs/sensor_param/{chosen}/intrinsic_cv", ndim=3))
+    extrinsics = first_matrix(read(group, f"obs/sensor_param/{chosen}/extrinsic_cv", ndim=3))
+    if extrinsics is not None and extrinsics.shape != (3, 4):
+        raise DatasetError(f"{path} ({name}): extrinsic_cv must be (T, 3, 4), got matrices of {extrinsics.shape}")
+    tcp = read(group, "obs/extra/tcp_pose", ndim=2)
+    actions = read(group, "actions", ndim=2)
     panda = _robots(group, kwargs) & set(PANDAS)
     return SourceEpisode(
         name=f"{path.name} ({name})",
         rgb=None if images is None else images[0],
         depth=None if depth is None else depth[0, ..., 0].astype(np.float32) * MILLIMETRE,
-        intrinsics=None if intrinsics is None else intrinsics[0].astype(np.float64),
-        camera_pose=None if extrinsics is None else invert_pose(np.vstack([extrinsics[0], [0, 0, 0, 1]])),
-        poses=None if tcp is None else _poses(tcp),
+        intrinsics=intrinsics,
+        camera_pose=None if extrinsics is None else invert_pose(np.vstack([extrinsics, [0, 0, 0, 1]])),
+        poses=None if tcp is None else poses_of(f"{path} ({name})", tcp, [4, 5, 6, 3]),
         tool=np.eye(4) if panda else None,
         # The command given at an observation; none is given at the last one, so the one before holds.
         gripper_values=None if actions is None else np.append(actions[:, -1], actions[-1, -1]).astype(np.float64),
         gripper=PANDA_GRIPPER if panda else None,
-        rate_hz=kwargs.get("sim_config", {}).get("control_freq"),
+        rate_hz=nested(kwargs, "sim_config").get("control_freq"),
         images=None if images is None else lambda: images,
         info={"source": path.name, "episode": name, "source_seed": str(episode.get("episode_seed"))},
         advice=ADVICE.format(path=path) if tcp is None or depth is None else "",
@@ -79,11 +89,4 @@ def _robots(group: Any, kwargs: Mapping[str, Any]) -> set[str]:
     """Names of the robot: what the environment was made with, or the articulations that moved in it."""
     if "robot_uids" in kwargs:
         return {str(kwargs["robot_uids"])}
-    return set(group["env_states/articulations"]) if "env_states/articulations" in group else set()
-
-
-def _poses(tcp: FloatArray) -> FloatArray:
-    poses = np.tile(np.eye(4), (len(tcp), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(tcp[:, [4, 5, 6, 3]]).as_matrix()
-    poses[:, :3, 3] = tcp[:, :3]
-    return poses
+    return set(members(group, "env_states/articulations"))

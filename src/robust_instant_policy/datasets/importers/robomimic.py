@@ -7,21 +7,28 @@ Each ``data/demo_i`` holds ``actions (T, A)``, ``obs/robot0_eef_pos`` and ``obs/
 
 from __future__ import annotations
 
-import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.datasets.importers.hdf5 import choose_camera, open_hdf5, read
-from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode
+from robust_instant_policy.datasets.importers.hdf5 import (
+    choose_camera,
+    members,
+    nested,
+    open_hdf5,
+    read,
+    read_json_attribute,
+)
+from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode, poses_of
 from robust_instant_policy.errors import DatasetError
 
 ROBOSUITE = 1  # env_type of robosuite
 ROBOSUITE_GRIPPER = GripperCommand(open=-1.0, closed=1.0)  # the same for all of robosuite's grippers
 TOOL_FRAMES = {"Panda": np.eye(4)}  # robots whose right_hand body already is the tool frame of `geometry`
+DEMONSTRATION = re.compile(r"demo_[0-9]{1,9}")
 HAND_CAMERA = "eye_in_hand"  # robomimic writes the pose of these relative to the hand
 ADVICE = (
     "Extract the observations with: python -m robomimic.scripts.dataset_states_to_obs --dataset {path} "
@@ -33,11 +40,8 @@ def read_robomimic(path: Path, camera: str | None) -> Iterator[SourceEpisode]:
     """The episodes of a robomimic file, in the order of their numbers."""
     with open_hdf5(path) as file:
         data = file["data"]
-        try:
-            environment = json.loads(data.attrs.get("env_args", "{}"))
-        except ValueError as error:
-            raise DatasetError(f"{path}: the attribute env_args of data is not JSON") from error
-        names = sorted((name for name in data if name.startswith("demo_")), key=lambda name: int(name[5:]))
+        environment = read_json_attribute(data, "env_args")
+        names = sorted(filter(DEMONSTRATION.fullmatch, members(file, "data")), key=lambda name: int(name[5:]))
         if not names:
             raise DatasetError(f"{path} holds no demonstrations")
         for name in names:
@@ -47,28 +51,27 @@ def read_robomimic(path: Path, camera: str | None) -> Iterator[SourceEpisode]:
 def _read_episode(
     path: Path, name: str, group: Any, camera: str | None, environment: Mapping[str, Any]
 ) -> SourceEpisode:
-    observations = group.get("obs", {})
-    cameras = [key.removesuffix("_image") for key in observations if key.endswith("_image")]
+    cameras = [key.removesuffix("_image") for key in members(group, "obs") if key.endswith("_image")]
     chosen = choose_camera(path, [one for one in cameras if HAND_CAMERA not in one], camera)
-    images, depth = (read(observations, f"{chosen}_{kind}") for kind in ("image", "depth"))
-    calibration = json.loads(group.attrs.get("camera_info", "{}")).get(chosen, {})
-    position, quaternion = (read(observations, f"robot0_eef_{kind}") for kind in ("pos", "quat"))
-    actions = read(group, "actions")
+    images, depth = (read(group, f"obs/{chosen}_{kind}", ndim=4) for kind in ("image", "depth"))
+    calibration = nested(read_json_attribute(group, "camera_info"), str(chosen))
+    position, quaternion = (read(group, f"obs/robot0_eef_{kind}", ndim=2) for kind in ("pos", "quat"))
+    actions = read(group, "actions", ndim=2)
     poses = None
     if position is not None and quaternion is not None:
-        poses = np.tile(np.eye(4), (len(position), 1, 1))
-        poses[:, :3, :3] = Rotation.from_quat(quaternion).as_matrix()
-        poses[:, :3, 3] = position
+        if position.shape != (len(quaternion), 3) or quaternion.shape[1] != 4:
+            raise DatasetError(f"{path} ({name}): robot0_eef_pos and _quat must be (T, 3) and (T, 4)")
+        poses = poses_of(f"{path} ({name})", np.hstack([position, quaternion]), [3, 4, 5, 6])
     from_robosuite = environment.get("env_type") == ROBOSUITE
-    settings = environment.get("env_kwargs", {})
+    settings = nested(environment, "env_kwargs")
     robots = settings.get("robots", "")
     robot = robots[0] if isinstance(robots, list) and len(robots) == 1 else robots
     return SourceEpisode(
         name=f"{path.name} ({name})",
         rgb=None if images is None else images[0],
-        depth=None if depth is None else depth[0].reshape(depth.shape[1:3]).astype(np.float32),
-        intrinsics=np.array(calibration["intrinsics"], dtype=np.float64) if "intrinsics" in calibration else None,
-        camera_pose=np.array(calibration["extrinsics"], dtype=np.float64) if "extrinsics" in calibration else None,
+        depth=None if depth is None else depth[0, ..., 0].astype(np.float32),
+        intrinsics=calibration.get("intrinsics"),
+        camera_pose=calibration.get("extrinsics"),
         poses=poses,
         tool=TOOL_FRAMES.get(robot) if from_robosuite and isinstance(robot, str) else None,
         gripper_values=None if actions is None else actions[:, -1].astype(np.float64),

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.trajectory import Trajectory
+
+MIN_QUATERNION = 1e-6  # shorter ones have no direction
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,23 @@ class GripperCommand:
         """Gripper state of ``values (T,)``: 0 nearer to open, 1 nearer to closed."""
         values = np.asarray(values, dtype=np.float64)
         return (np.abs(values - self.closed) < np.abs(values - self.open)).astype(np.float64)
+
+
+def poses_of(name: str, numbers: NDArray, rotation: Sequence[int]) -> FloatArray:
+    """Poses ``(T, 4, 4)`` of ``numbers (T, D)``: three coordinates, and the rotation in the columns ``rotation``, three
+    of a rotation vector or four of a quaternion x, y, z, w.
+
+    Raises `DatasetError` that begins with ``name`` where they are no poses.
+    """
+    if numbers.ndim != 2 or numbers.shape[1] < 3 + len(rotation) or not np.isfinite(numbers).all():
+        raise DatasetError(f"{name}: poses must be finite, (T, {3 + len(rotation)}), got {numbers.shape}")
+    turns = numbers[:, list(rotation)].astype(np.float64)
+    if len(rotation) == 4 and np.linalg.norm(turns, axis=1).min() < MIN_QUATERNION:
+        raise DatasetError(f"{name}: quaternions must have length 1, and one is 0")
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    poses[:, :3, :3] = (Rotation.from_quat if len(rotation) == 4 else Rotation.from_rotvec)(turns).as_matrix()
+    poses[:, :3, 3] = numbers[:, :3]
+    return poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +118,20 @@ class SourceEpisode:
             or self.rate_hz is None
         ):
             raise DatasetError(f"{self.name} lacks {'; '.join(self._missing())}{self.advice and '. ' + self.advice}")
+        if len(self.poses) != len(self.gripper_values):
+            raise DatasetError(
+                f"{self.name} is damaged: it has {len(self.poses)} poses and {len(self.gripper_values)} gripper values"
+            )
+        if not np.isfinite(self.gripper_values).all():
+            raise DatasetError(f"{self.name} is damaged: its gripper values are not all finite")
         try:
             trajectory = Trajectory.from_poses(
                 self.poses @ self.tool, self.gripper.state(self.gripper_values), triangle
             )
             observation = Observation(self.rgb, self.depth, self.intrinsics, self.camera_pose)
+            return Demonstration(observation, trajectory, self.rate_hz, task, info=self.info)
         except InvalidValueError as error:
             raise DatasetError(f"{self.name}: {error}") from error
-        return Demonstration(observation, trajectory, self.rate_hz, task, info=self.info)
 
     def _missing(self) -> list[str]:
         values = self.gripper_values

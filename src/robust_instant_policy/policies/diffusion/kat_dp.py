@@ -5,7 +5,6 @@ The method of the paper's comparison (Di Palo and Johns 2024; Oh et al. 2025, Se
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -13,17 +12,17 @@ import torch
 from torch import Tensor, nn
 
 from robust_instant_policy.context.alignment import align
-from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.policies.aggregation import take_first
+from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.diffusion.denoiser import Denoiser
 from robust_instant_policy.policies.diffusion.grippers import Grippers
 from robust_instant_policy.policies.diffusion.scaling import Scaling
 from robust_instant_policy.policies.diffusion.training import Rehearsal, Trained, TrainingSettings, known_by, obtain
-from robust_instant_policy.policies.instant import Proposal
-from robust_instant_policy.policies.kat import plan_of_first_candidate
-from robust_instant_policy.policies.keypoint_context import KeypointContext
-from robust_instant_policy.policies.policy import Plan, Stopwatch, Usage
+from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
+from robust_instant_policy.policies.policy import Plan, Progress, Stopwatch, no_progress
+from robust_instant_policy.policies.sampling import Proposal
+from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.policies.training import Training
 from robust_instant_policy.trajectory import Trajectory
 
@@ -35,25 +34,32 @@ KEYPOINT_NOISE_M = 0.003  # keypoints of a new scene are about this uncertain; t
 LENGTH_MULTIPLE = 4  # of the sequences that the network takes
 
 
-class KeypointDiffusion:
-    """Whole trajectories, thinned out as for KAT, sampled by diffusion given the scene's keypoints; open loop.
+class KeypointDiffusion(KeypointPolicy):
+    """Whole trajectories, downsampled as for KAT, sampled by diffusion given the scene's keypoints; open loop.
 
-    ``num_queries`` samples are drawn and the first one is executed, as KAT takes its model at its word.
+    ``num_queries`` samples are drawn and the first one is executed, as KAT does.
     """
 
     name = METHOD
     trained_: Trained
 
-    def __init__(self, context: KeypointContext, num_queries: int = 5, training: Training | None = None):
-        self.context, self.num_queries = context, num_queries
+    def __init__(
+        self,
+        settings: Settings | None = None,
+        training: Training | None = None,
+        *,
+        progress: Progress = no_progress,
+        **options: object,
+    ):
+        super().__init__(settings, progress=progress, **options)
         self.training = training or Training()
 
-    def fit(self, demonstrations: Sequence[Demonstration]) -> Self:
-        """Load the weights that belong to ``demonstrations``, or train them; returns itself."""
-        self.context.fit(demonstrations)
-        self._written = self.context.trajectories_
-        aligned = align(self._written)
-        keypoints = self.context.keypoints_[list(aligned.kept)].reshape(len(aligned.kept), -1)
+    def fit_context(self, context: Context) -> Self:
+        """Load the weights that belong to the demonstrations, or train them; returns itself."""
+        super().fit_context(context)
+        demonstrations = context.demonstrations
+        aligned = align(context.trajectories)
+        keypoints = context.keypoints[list(aligned.kept)].reshape(len(aligned.kept), -1)
         actions = aligned.actions
         self._keypoints, self._actions = keypoints, actions
         self._inputs, self._outputs, self._grippers = Scaling.of(keypoints), Scaling.of(actions), Grippers.of(actions)
@@ -69,7 +75,7 @@ class KeypointDiffusion:
             NOISE_DRAWS,
             LEARNING_RATE,
             self.training.seed,
-            details=self.context.settings,
+            details=_described(self.settings),
         )
         self.trained_ = obtain(
             lambda: Denoiser(nn.Identity(), keypoints.shape[1], actions.shape[2]),
@@ -82,20 +88,15 @@ class KeypointDiffusion:
         )
         return self
 
-    def plan(self, observation: Observation) -> Plan:
-        """Raises `KeypointError` where the scene cannot be recognised."""
-        if not hasattr(self, "trained_"):
-            raise UsageError("call fit(demonstrations) before asking for a plan")
-        located, locating = self.context.locate(observation, self._written)
+    def plan_scene(self, scene: LocatedScene) -> Plan:
         watch = Stopwatch()
         with watch.stage("diffusion"):
-            candidates = self._sampled(located.keypoints, self.trained_.model)
-        notes = (*self.context.extractor.notes_, *located.notes)
-        return plan_of_first_candidate(Proposal(located, candidates, Usage((locating, *watch.stages)), notes))
+            candidates = self._sampled(scene.keypoints, self.trained_.model)
+        return take_first(self.context_, scene, Proposal(candidates, tuple(watch.stages)))
 
     def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
         """The first sample."""
-        return (plan.trajectory,)
+        return plan.candidates[:1]
 
     def rehearse(self, count: int) -> list[Rehearsal]:
         """Its samples in the scenes of the first ``count`` demonstrations."""
@@ -110,7 +111,7 @@ class KeypointDiffusion:
         generator = torch.Generator().manual_seed(self.training.seed)
         num_steps = self._actions.shape[1]
         length = -(-num_steps // LENGTH_MULTIPLE) * LENGTH_MULTIPLE
-        samples = model.sample(condition.expand(self.num_queries, -1), length, generator)
+        samples = model.sample(condition.expand(self.settings.num_queries, -1), length, generator)
         actions = self._outputs.restored(samples.cpu().numpy().astype(np.float64))
         return tuple(Trajectory.from_actions(self._grippers.nearest(own[:num_steps])) for own in actions)
 
@@ -133,3 +134,11 @@ class _KeypointData:
 def _padded(actions: FloatArray) -> FloatArray:
     """``actions (I, T, D)`` with the last step repeated up to a length that the network takes."""
     return np.pad(actions, ((0, 0), (0, -actions.shape[1] % LENGTH_MULTIPLE), (0, 0)), mode="edge")
+
+
+def _described(settings: Settings) -> str:
+    """What decides the weights beside the demonstrations."""
+    return (
+        f"{settings.num_keypoints} keypoints by {settings.features}, "
+        f"{settings.downsampling} downsampling to {settings.num_steps} steps"
+    )

@@ -91,8 +91,8 @@ class AlohaEnv(gymnasium.Env):
         """Add the episode's objects, drawn from `draw`, to ``spec``."""
         raise NotImplementedError
 
-    def evaluate(self) -> dict[str, Any]:
-        """How things stand; ``success`` is bool."""
+    def failure(self) -> str:
+        """Why the task is not done, in words; nothing once it is."""
         raise NotImplementedError
 
     def draw(self, what: str) -> np.random.Generator:
@@ -125,8 +125,8 @@ class AlohaEnv(gymnasium.Env):
 
     def step(self, action: FloatArray) -> tuple[dict, float, bool, bool, dict]:
         self.advance(np.asarray(action, dtype=np.float64))
-        state = self.evaluate()
-        return self._observation(), float(state["success"]), False, False, state
+        failure = self.failure()
+        return self._observation(), float(not failure), False, False, {"success": not failure, "failure": failure}
 
     def advance(self, command: FloatArray) -> None:
         """One control step, with joint angles and finger travel ``(7·A,)`` commanded, judging nothing."""

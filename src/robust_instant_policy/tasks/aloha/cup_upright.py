@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 import numpy as np
 
@@ -41,11 +39,14 @@ class CupUprightEnv(AlohaEnv):
         yaw = rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD)
         self.cup.build(spec, "cup", facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), yaw) @ self.cup.lying())
 
-    def evaluate(self) -> dict[str, Any]:
+    def failure(self) -> str:
         lean = float(np.arccos(np.clip(self.pose_of("cup")[2, 2], -1, 1)))
-        stands = lean < UPRIGHT_RAD and self.touch("cup", "world") > 0
-        let_go = not self.is_held("cup")
-        return {"success": stands and let_go and self.is_still("cup"), "lean": lean, "let_go": let_go}
+        if self.is_held("cup"):
+            return "the cup is still in the fingers"
+        if lean >= UPRIGHT_RAD:
+            return f"the cup leans by {np.rad2deg(lean):.0f} degrees"
+        at_rest = self.touch("cup", "world") > 0 and self.is_still("cup")
+        return "" if at_rest else "the cup is upright but not at rest on the table"
 
 
 def stand_up(env: CupUprightEnv, rng: np.random.Generator) -> list[Stroke]:
@@ -70,23 +71,10 @@ def stand_up(env: CupUprightEnv, rng: np.random.Generator) -> list[Stroke]:
     ]
 
 
-def verdict(env: CupUprightEnv) -> str:
-    """Why the task failed, or nothing."""
-    state = env.evaluate()
-    if state["success"]:
-        return ""
-    if not state["let_go"]:
-        return "the cup is still in the fingers"
-    if state["lean"] < UPRIGHT_RAD:
-        return "the cup is upright but not at rest on the table"
-    return f"the cup leans by {np.rad2deg(state['lean']):.0f} degrees"
-
-
 SPEC = TaskSpec(
     name="aloha-cup-upright",
     description="stand the lying cup upright",
     goal="the cup stands upright on the table",
     env_id="RIP-AlohaCupUpright-v1",
     expert=stand_up,
-    verdict=verdict,
 )

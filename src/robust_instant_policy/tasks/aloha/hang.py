@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 import numpy as np
 
@@ -48,12 +46,13 @@ class HangEnv(AlohaEnv):
         yaw = bearing(np.array([x, y, 0.0])) + rng.uniform(-STAND_YAW_RAD, STAND_YAW_RAD)
         self.stand.build(spec, "stand", facing(x, y, yaw))
 
-    def evaluate(self) -> dict[str, Any]:
-        on_rod = self.touch("hanger", "stand") > 0
-        off_table = self.touch("hanger", "world") == 0 and self.touch("hanger", "stand-board") == 0
-        let_go = not self.is_held("hanger")
+    def failure(self) -> str:
+        if self.is_held("hanger"):
+            return "the hanger is still in the fingers"
+        if self.touch("hanger", "world") > 0 or self.touch("hanger", "stand-board") > 0:
+            return "the hanger fell, or was never lifted"
         slow = float(np.linalg.norm(self.data.joint("hanger").qvel[:3])) < SLOW_M_S
-        return {"success": on_rod and off_table and let_go and slow, "off_table": off_table, "let_go": let_go}
+        return "" if self.touch("hanger", "stand") > 0 and slow else "the hanger does not hang on the rod"
 
 
 def hang(env: HangEnv, rng: np.random.Generator) -> list[Stroke]:
@@ -85,21 +84,10 @@ def hang(env: HangEnv, rng: np.random.Generator) -> list[Stroke]:
     ]
 
 
-def verdict(env: HangEnv) -> str:
-    """Why the task failed, or nothing."""
-    state = env.evaluate()
-    if state["success"]:
-        return ""
-    if not state["let_go"]:
-        return "the hanger is still in the fingers"
-    return "the hanger does not hang on the rod" if state["off_table"] else "the hanger fell, or was never lifted"
-
-
 SPEC = TaskSpec(
     name="aloha-hang",
     description="hang the clothes hanger on the rod",
     goal="the hanger hangs on the rod",
     env_id="RIP-AlohaHang-v1",
     expert=hang,
-    verdict=verdict,
 )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 import numpy as np
 
@@ -48,20 +46,14 @@ class PickBananaEnv(AlohaEnv):
         """The banana's frame ``(4, 4)`` in the world: its middle, x along the fruit."""
         return self.pose_of("banana")
 
-    def evaluate(self) -> dict[str, Any]:
+    def failure(self) -> str:
         lifted = bool(self.middle()[2, 3] > self.shape.radius + LIFTED_M)
-        held = self.is_held("banana")
-        return {"success": lifted and held and self.arm_is_still(), "lifted": lifted, "held": held}
+        return failure_of_pick("banana", lifted, self.is_held("banana"), self.arm_is_still())
 
 
 def pick(env: PickBananaEnv, rng: np.random.Generator) -> list[Stroke]:
     """Across the middle of the fruit."""
     return PICK.strokes(env.middle(), rng)
-
-
-def verdict(env: PickBananaEnv) -> str:
-    """Why the task failed, or nothing."""
-    return failure_of_pick(env.evaluate(), "banana")
 
 
 SPEC = TaskSpec(
@@ -70,5 +62,4 @@ SPEC = TaskSpec(
     goal="the banana is held above the table",
     env_id="RIP-AlohaPickBanana-v1",
     expert=pick,
-    verdict=verdict,
 )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 import numpy as np
 
@@ -40,12 +38,15 @@ class PickPlaceEnv(AlohaEnv):
         self.bowl.build(spec, "bowl", facing(bowl_x, bowl_y, 0.0))
         self.bottle.build(spec, "bottle", facing(x, y, rng.uniform(-np.pi, np.pi)))
 
-    def evaluate(self) -> dict[str, Any]:
-        off = float(np.linalg.norm((self.pose_of("bottle") - self.pose_of("bowl"))[:2, 3]))
-        inside = off < self.bowl.radius and self.touch("bottle", "bowl") > 0 and self.touch("bottle", "world") == 0
-        let_go = not self.is_held("bottle")
-        still = self.is_still("bottle") and self.is_still("bowl")
-        return {"success": inside and let_go and still, "inside": inside, "let_go": let_go, "off": off}
+    def failure(self) -> str:
+        distance = float(np.linalg.norm((self.pose_of("bottle") - self.pose_of("bowl"))[:2, 3]))
+        if self.is_held("bottle"):
+            return "the bottle is still in the fingers"
+        if distance >= self.bowl.radius or self.touch("bottle", "bowl") == 0 or self.touch("bottle", "world") > 0:
+            return f"the bottle is {1e3 * distance:.0f} mm from the bowl's middle, not in it"
+        if not (self.is_still("bottle") and self.is_still("bowl")):
+            return "the bottle is in the bowl but still moving"
+        return ""
 
 
 def apart(
@@ -75,24 +76,11 @@ def pick_and_place(env: PickPlaceEnv, rng: np.random.Generator) -> list[Stroke]:
     ]
 
 
-def verdict(env: PickPlaceEnv) -> str:
-    """Why the task failed, or nothing."""
-    state = env.evaluate()
-    if state["success"]:
-        return ""
-    if not state["let_go"]:
-        return "the bottle is still in the fingers"
-    if state["inside"]:
-        return "the bottle is in the bowl but still moving"
-    return f"the bottle is {1e3 * state['off']:.0f} mm from the bowl's middle, not in it"
-
-
 SPEC = TaskSpec(
     name="aloha-pick-place",
     description="put the bottle into the red bowl",
     goal="the bottle is in the red bowl",
     env_id="RIP-AlohaPickPlace-v1",
     expert=pick_and_place,
-    verdict=verdict,
     object_sets=("seen", "unseen"),
 )

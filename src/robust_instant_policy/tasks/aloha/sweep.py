@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -69,13 +69,15 @@ class SweepEnv(AlohaEnv):
         if self.touch("brush", "world") > 0 and self.is_held("brush"):
             self._touched += 1 / CONTROL_HZ
 
-    def evaluate(self) -> dict[str, Any]:
+    def failure(self) -> str:
         x, y, z = transform_points(invert_pose(self.pose_of("dustpan")), self.pose_of("dust")[:3, 3])
-        inside = self.pan.lip < x < self.pan.depth and abs(y) < self.pan.width / 2 and z < self.pan.wall
-        touched = self._touched >= TOUCHED_SECONDS
-        kept = self.is_held("dustpan", "right") or self.touch("dustpan", "world") > 0
-        success = bool(inside and touched and kept)
-        return {"success": success, "inside": bool(inside), "touched": touched, "kept": kept, "short": -float(x)}
+        if not (self.pan.lip < x < self.pan.depth and abs(y) < self.pan.width / 2 and z < self.pan.wall):
+            return f"the object is not in the dustpan, but {-1e3 * x:.0f} mm before its lip"
+        if not (self.is_held("dustpan", "right") or self.touch("dustpan", "world") > 0):
+            return "the object is in the dustpan, but that is neither held nor on the table"
+        if self._touched < TOUCHED_SECONDS:
+            return "the object is in the dustpan, but the brush hardly touched the table"
+        return ""
 
 
 def sweep(env: SweepEnv, rng: np.random.Generator) -> list[Stroke]:
@@ -122,24 +124,11 @@ def sweep(env: SweepEnv, rng: np.random.Generator) -> list[Stroke]:
     ]
 
 
-def verdict(env: SweepEnv) -> str:
-    """Why the task failed, or nothing."""
-    state = env.evaluate()
-    if state["success"]:
-        return ""
-    if not state["inside"]:
-        return f"the object is not in the dustpan, but {1e3 * state['short']:.0f} mm before its lip"
-    if not state["kept"]:
-        return "the object is in the dustpan, but that is neither held nor on the table"
-    return "the object is in the dustpan, but the brush hardly touched the table"
-
-
 SPEC = TaskSpec(
     name="aloha-sweep",
     description="sweep the object into the dustpan with the brush",
     goal="the object is in the dustpan",
     env_id="RIP-AlohaSweep-v1",
     expert=sweep,
-    verdict=verdict,
     object_sets=("seen", "unseen"),
 )

@@ -111,13 +111,21 @@ class CellEnv(BaseEnv):
     def _before_control_step(self) -> None:
         self._joints_before = self.agent.robot.get_qpos().clone()
 
-    def arm_is_still(self) -> torch.Tensor:
+    def failure(self) -> str:
+        """Why the task is not done, in words; nothing once it is."""
+        raise NotImplementedError
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """What ManiSkill asks of an environment."""
+        return {"success": torch.tensor([not self.failure()])}
+
+    def arm_is_still(self) -> bool:
         """Whether no arm joint moved faster than `STILL_RAD_S` over the last control step.
 
         Judged by the angles: with something between the fingers PhysX reports joint speeds that move nothing.
         """
         moved = (self.agent.robot.get_qpos() - self._joints_before)[:, : len(HOME_JOINTS)]
-        return moved.abs().amax(dim=1) * self.control_freq <= STILL_RAD_S
+        return bool(moved.abs().amax() * self.control_freq <= STILL_RAD_S)
 
     def draw(self, what: str) -> np.random.Generator:
         """The episode's random numbers for ``what`` ("shape", "pose"), the same for the same seed."""

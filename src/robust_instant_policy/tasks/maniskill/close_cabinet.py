@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from mani_skill.utils.registration import register_env
@@ -60,9 +58,11 @@ class CloseCabinetEnv(CellEnv):
         )
         self.cabinet.place(self.front_pose, rng.uniform(*OPEN_RANGE_RAD))
 
-    def evaluate(self) -> dict:
-        angle, still = self.cabinet.position, self.cabinet.is_still(STILL_M_S, STILL_RAD_S)
-        return {"success": (angle < CLOSED_RAD) & still, "angle": angle, "still": still}
+    def failure(self) -> str:
+        angle = float(self.cabinet.position)
+        if angle >= CLOSED_RAD:
+            return f"the door is {np.rad2deg(angle):.1f} degrees open, {np.rad2deg(CLOSED_RAD):.0f} allowed"
+        return "" if self.cabinet.is_still(STILL_M_S, STILL_RAD_S) else "the door is shut but still moving"
 
 
 def shut(env: CloseCabinetEnv, rng: np.random.Generator) -> list[Stroke]:
@@ -87,22 +87,12 @@ def shut(env: CloseCabinetEnv, rng: np.random.Generator) -> list[Stroke]:
     ]
 
 
-def verdict(env: CloseCabinetEnv) -> str:
-    """Why the task failed, or nothing."""
-    state: dict[str, Any] = env.evaluate()
-    angle = np.rad2deg(float(state["angle"]))
-    if angle >= np.rad2deg(CLOSED_RAD):
-        return f"the door is {angle:.1f} degrees open, {np.rad2deg(CLOSED_RAD):.0f} allowed"
-    return "" if bool(state["still"]) else "the door is shut but still moving"
-
-
 SPEC = TaskSpec(
     name="close-cabinet",
     description="push the cabinet's door shut",
     goal="the cabinet's door is shut",
     env_id="RIP-CloseCabinet-v1",
     expert=shut,
-    verdict=verdict,
     object_sets=("seen", "unseen"),
     asset_sources=("code", "maniskill"),
 )

@@ -89,11 +89,11 @@ class Mechanism:
         self.articulation.set_qpos(joints)
         self.articulation.set_qvel(torch.zeros_like(joints))
 
-    def is_still(self, linear: float, angular: float) -> torch.Tensor:
-        """Whether the moving link is slower than ``linear`` m/s and ``angular`` rad/s, ``(1,)`` bool."""
+    def is_still(self, linear: float, angular: float) -> bool:
+        """Whether the moving link is no faster than ``linear`` m/s and ``angular`` rad/s."""
         link = self.moving_link
-        slow = torch.linalg.norm(link.linear_velocity, dim=1) <= linear
-        return slow & (torch.linalg.norm(link.angular_velocity, dim=1) <= angular)
+        slow = bool(torch.linalg.norm(link.linear_velocity) <= linear)
+        return slow and bool(torch.linalg.norm(link.angular_velocity) <= angular)
 
 
 def closed_joints(articulation: Articulation) -> torch.Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from mani_skill.utils.registration import register_env
@@ -51,10 +49,11 @@ class OpenDrawerEnv(CellEnv):
         )
         self.chest.place(self.front_pose, 0.0)
 
-    def evaluate(self) -> dict:
-        still = self.chest.is_still(STILL_M_S, STILL_RAD_S)
-        share = self.chest.position / self.drawer.travel
-        return {"success": (share >= OPEN_SHARE) & still, "open_share": share, "still": still}
+    def failure(self) -> str:
+        share = float(self.chest.position / self.drawer.travel)
+        if share < OPEN_SHARE:
+            return f"the drawer is {max(share, 0.0):.0%} open, {OPEN_SHARE:.0%} wanted"
+        return "" if self.chest.is_still(STILL_M_S, STILL_RAD_S) else "the drawer is open but still moving"
 
 
 def pull(env: OpenDrawerEnv, rng: np.random.Generator) -> list[Stroke]:
@@ -71,21 +70,11 @@ def pull(env: OpenDrawerEnv, rng: np.random.Generator) -> list[Stroke]:
     ]
 
 
-def verdict(env: OpenDrawerEnv) -> str:
-    """Why the task failed, or nothing."""
-    state: dict[str, Any] = env.evaluate()
-    share = float(state["open_share"])
-    if share < OPEN_SHARE:
-        return f"the drawer is {max(share, 0.0):.0%} open, {OPEN_SHARE:.0%} wanted"
-    return "" if bool(state["still"]) else "the drawer is open but still moving"
-
-
 SPEC = TaskSpec(
     name="open-drawer",
     description="pull the drawer open by its handle",
     goal="the drawer is open",
     env_id="RIP-OpenDrawer-v1",
     expert=pull,
-    verdict=verdict,
     asset_sources=("code", "maniskill"),
 )

@@ -71,10 +71,9 @@ class PickBananaEnv(CellEnv):
         """The banana's frame ``(4, 4)`` in the world: its middle, x along the fruit."""
         return self.banana.pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64) @ self.lie
 
-    def evaluate(self) -> dict:
-        lifted = torch.tensor([self.middle()[2, 3] > self.rest_height + LIFTED_M])
-        held = self.agent.is_grasping(self.banana)
-        return {"success": lifted & held & self.arm_is_still(), "lifted": lifted, "held": held}
+    def failure(self) -> str:
+        lifted = bool(self.middle()[2, 3] > self.rest_height + LIFTED_M)
+        return failure_of_pick("banana", lifted, bool(self.agent.is_grasping(self.banana)), self.arm_is_still())
 
 
 def _build(shape: Banana, scene: Any) -> Actor:
@@ -98,17 +97,11 @@ def pick(env: PickBananaEnv, rng: np.random.Generator) -> list[Stroke]:
     return PICK.strokes(env.middle(), rng)
 
 
-def verdict(env: PickBananaEnv) -> str:
-    """Why the task failed, or nothing."""
-    return failure_of_pick(env.evaluate(), "banana")
-
-
 SPEC = TaskSpec(
     name="pick-banana",
     description="pick the banana from the table",
     goal="the banana is held above the table",
     env_id="RIP-PickBanana-v1",
     expert=pick,
-    verdict=verdict,
     asset_sources=("code", "maniskill"),
 )

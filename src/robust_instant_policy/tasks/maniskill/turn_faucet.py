@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from mani_skill.utils.registration import register_env
@@ -56,9 +54,11 @@ class TurnFaucetEnv(CellEnv):
         )
         self.faucet.place(self.foot_pose, 0.0)
 
-    def evaluate(self) -> dict:
-        share = self.faucet.position / self.lever.turn
-        return {"success": share > TARGET_SHARE, "turned_share": share}
+    def failure(self) -> str:
+        share = float(self.faucet.position / self.lever.turn)
+        if share > TARGET_SHARE:
+            return ""
+        return f"the lever is turned by {max(share, 0.0):.0%} of its range, {TARGET_SHARE:.0%} wanted"
 
 
 def turn(env: TurnFaucetEnv, rng: np.random.Generator) -> list[Stroke]:
@@ -84,22 +84,12 @@ def turn(env: TurnFaucetEnv, rng: np.random.Generator) -> list[Stroke]:
     ]
 
 
-def verdict(env: TurnFaucetEnv) -> str:
-    """Why the task failed, or nothing."""
-    state: dict[str, Any] = env.evaluate()
-    if bool(state["success"]):
-        return ""
-    share = max(float(state["turned_share"]), 0.0)
-    return f"the lever is turned by {share:.0%} of its range, {TARGET_SHARE:.0%} wanted"
-
-
 SPEC = TaskSpec(
     name="turn-faucet",
     description="turn the faucet's lever",
     goal="the faucet is turned on",
     env_id="RIP-TurnFaucet-v1",
     expert=turn,
-    verdict=verdict,
     object_sets=("seen", "unseen"),
     asset_sources=("code", "maniskill"),
 )

@@ -1,28 +1,26 @@
-"""The curve μ(t): straight pieces between knots, drawn towards straight lines except where the data show a corner.
+"""The curve μ(t): linear between knots, one knot a step, and its second differences.
 
-There is a knot for every step, so that no corner, pause or grasp is too sharp for it; what keeps the curve from
-following noise is a price on its accelerations. How many of its coefficients are then free, its effective size, is
-chosen from the data.
+No corner, pause or grasp is too sharp for it. What keeps it from following noise is a penalty on second differences.
+Symmetric matrices over the knots are stored as lower bands ``(3, K)``, LAPACK's layout.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.linalg.lapack import dpbsv
-from scipy.sparse import csr_array
 
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.regression.alignment import Candidates
+from robust_instant_policy.regression.candidates import Candidates
 
-BANDS = 3  # diagonal and two below it: what accelerations couple
-FAINT = 1e-6  # stiffness that only ties down knots between which no candidate has a sample
+BANDS = 3  # diagonal and two below it: what second differences couple
 
 
 class HatBasis:
-    """Curves linear between ``knots (K,)``, seen at the times of Q candidates with N samples in all.
+    """H: curves linear between ``knots (K,)``, seen at the times of Q candidates with N samples in all.
 
-    ``values - basis.at_samples(curve)`` are residuals. When all candidates were sampled at the knots nothing is
-    interpolated, fitting is averaging, and sums over candidates replace sparse products.
+    When all candidates were sampled at the knots H is a stack of identities, and sums over candidates replace sparse
+    products.
     """
 
     def __init__(self, data: Candidates):
@@ -33,22 +31,17 @@ class HatBasis:
         if self.on_knots:
             self._nearest = np.tile(np.arange(len(self.knots)), len(data))
             return
-        count, rows = len(self.knots), np.arange(len(data.times))
-        left = np.clip(np.searchsorted(self.knots, data.times, side="right") - 1, 0, max(count - 2, 0))
-        right = np.minimum(left + 1, count - 1)
-        fraction = np.clip(
-            (data.times - self.knots[left]) / np.maximum(self.knots[right] - self.knots[left], 1e-300), 0, 1
-        )
-        self._left, self._fraction = left, fraction
-        self._nearest = np.where(fraction > 0.5, right, left)
-        self._matrix = csr_array(
-            (np.concatenate([1 - fraction, fraction]), (np.tile(rows, 2), np.concatenate([left, right]))),
-            shape=(len(rows), count),
-        )
-        self._transpose = self._matrix.T.tocsr()
+        knots = np.array([self.knots[0], *self.knots, self.knots[-1]])
+        matrix = BSpline.design_matrix(data.times, knots, 1)
+        self._matrix, self._transpose = matrix, matrix.T.tocsr()
+        self._squares = matrix.multiply(matrix).T.tocsr()
+        self._neighbours = matrix[:, :-1].multiply(matrix[:, 1:]).T.tocsr()
+        left = np.clip(np.searchsorted(self.knots, data.times, side="right") - 1, 0, len(self.knots) - 2)
+        fraction = (data.times - self.knots[left]) / (self.knots[left + 1] - self.knots[left])
+        self._nearest = left + (fraction > 0.5)
 
     def residuals(self, values: FloatArray, curve: FloatArray) -> FloatArray:
-        """``values (N, D)`` less the ``curve (K, D)`` at their times."""
+        """``values - H curve`` ``(N, D)`` of a ``curve (K, D)``."""
         if self.on_knots:
             return (values.reshape(*self._shape, -1) - curve).reshape(values.shape)
         return values - self._matrix @ curve
@@ -64,11 +57,8 @@ class HatBasis:
         weighted = weights[:, None] * rows
         if self.on_knots:
             return weighted.reshape(*self._shape, -1).swapaxes(0, 1)
-        pieces = [
-            self._transpose[:, start:stop] @ weighted[start:stop]
-            for start, stop in zip(self._starts[:-1], self._starts[1:], strict=True)
-        ]
-        return np.stack(pieces, axis=1)
+        spans = zip(self._starts[:-1], self._starts[1:], strict=True)
+        return np.stack([self._transpose[:, start:stop] @ weighted[start:stop] for start, stop in spans], axis=1)
 
     def normal_matrix(self, weights: FloatArray) -> FloatArray:
         """``Hᵀ diag(weights) H`` for ``weights (N,)``, as lower bands ``(3, K)``."""
@@ -76,11 +66,7 @@ class HatBasis:
         if self.on_knots:
             bands[0] = weights.reshape(self._shape).sum(axis=0)
             return bands
-        left, fraction, count = self._left, self._fraction, len(self.knots)
-        rest = 1 - fraction
-        bands[0] = np.bincount(left, weights * rest**2, count)
-        bands[0, 1:] += np.bincount(left, weights * fraction**2, count)[:-1]
-        bands[1] = np.bincount(left, weights * rest * fraction, count)
+        bands[0], bands[1, :-1] = self._squares @ weights, self._neighbours @ weights
         return bands
 
     def spread(self, at_knots: FloatArray) -> FloatArray:
@@ -94,8 +80,8 @@ class HatBasis:
         return np.bincount(self._nearest, at_samples, len(self.knots)).astype(np.float64)
 
 
-class Roughness:
-    """Accelerations of a curve: second divided differences at inner knots, in units of the mean knot spacing."""
+class SecondDifferences:
+    """G: second divided differences of a curve at inner ``knots``, in units of the mean knot spacing."""
 
     def __init__(self, knots: FloatArray):
         self.count = max(len(knots) - 2, 0)
@@ -107,20 +93,26 @@ class Roughness:
         self._products = unit**2 * np.stack([first**2, middle**2, last**2, first * middle, middle * last, first * last])
 
     def __call__(self, curve: FloatArray) -> FloatArray:
-        """Accelerations ``(K-2, D)`` of a curve ``(K, D)``."""
+        """``G curve``: ``(K-2, D)`` from ``curve (K, D)``."""
         first, middle, last = self._stencil
         return first * curve[:-2] + middle * curve[1:-1] + last * curve[2:]
 
-    def matrix(self, weights: FloatArray) -> FloatArray:
-        """``Gᵀ diag(weights) G`` for ``weights (K-2,)``, as lower bands ``(3, K)``."""
+    def transpose(self, rows: FloatArray) -> FloatArray:
+        """``Gᵀ rows``: ``(K, D)`` from ``rows (K-2, D)``."""
+        result = np.zeros((self.count + 2, rows.shape[1]))
+        for offset, coefficients in enumerate(self._stencil):
+            result[offset : offset + self.count] += coefficients * rows
+        return result
+
+    def penalty_matrix(self, prices: FloatArray) -> FloatArray:
+        """``Gᵀ diag(prices) G`` for ``prices (K-2,)``, as lower bands ``(3, K)``."""
         bands = np.zeros((BANDS, self.count + 2))
-        parts = weights * self._products
-        bands[0, :-2] = parts[0]
-        bands[0, 1:-1] += parts[1]
-        bands[0, 2:] += parts[2]
-        bands[1, :-2] = parts[3]
-        bands[1, 1:-1] += parts[4]
-        bands[2, :-2] = parts[5]
+        first, middle, last, *neighbours, ends = prices * self._products
+        bands[0, :-2] = first
+        bands[0, 1:-1] += middle
+        bands[0, 2:] += last
+        bands[1, :-2], bands[2, :-2] = neighbours[0], ends
+        bands[1, 1:-1] += neighbours[1]
         return bands
 
 
@@ -128,6 +120,7 @@ def solve_banded(bands: FloatArray, right_side: FloatArray) -> FloatArray:
     """Solve the symmetric positive definite system with lower bands ``bands (3, K)`` for ``right_side (K, M)``."""
     if not bands[1:].any():
         return right_side / bands[0][:, None]
+    # scipy's solveh_banded calls the same routine, in twice the time for matrices this small
     _, solution, info = dpbsv(bands[: len(right_side)], right_side, lower=1)
     if info:
         raise np.linalg.LinAlgError(f"normal equations of {len(right_side)} knots are singular (at {info})")

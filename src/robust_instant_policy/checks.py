@@ -1,0 +1,54 @@
+"""Checks of numbers that come from outside: one clear line where they are given."""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral, Real
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robust_instant_policy.errors import InvalidValueError
+
+
+def checked_positive(name: str, value: object, infinite: bool = False) -> float:
+    """``value`` as a float > 0; ``infinite`` allows infinity. Text, booleans and NaN raise `InvalidValueError`."""
+    if _is_number(value, Real) and value > 0 and (infinite or math.isfinite(value)):  # type: ignore[operator, arg-type]
+        return float(value)  # type: ignore[arg-type]
+    raise InvalidValueError(
+        f"{name} must be a positive {'number or inf' if infinite else 'finite number'}, {_got(value)}"
+    )
+
+
+def checked_whole(name: str, value: object, least: int = 0) -> int:
+    """``value`` as an int of at least ``least``. Text, booleans and fractions raise `InvalidValueError`."""
+    if _is_number(value, Integral) and value >= least:  # type: ignore[operator]
+        return int(value)  # type: ignore[call-overload]
+    raise InvalidValueError(f"{name} must be a whole number of at least {least}, {_got(value)}")
+
+
+def checked_array(name: str, values: ArrayLike, shape: str) -> NDArray[np.float64]:
+    """``values`` as finite float64 with as many dimensions as ``shape`` names, such as "(T, D)".
+
+    Text, booleans, complex numbers, NaN and infinity raise `InvalidValueError`.
+    """
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise InvalidValueError(f"{name} must be {shape}, an array of numbers: {error}") from None
+    if array.dtype.kind not in "iuf" and array.size:
+        raise InvalidValueError(f"{name} must be {shape}, an array of numbers, got elements of type {array.dtype}")
+    if array.ndim != len(shape.strip("()").removesuffix(",").split(",")):
+        raise InvalidValueError(f"{name} must be {shape}, got shape {array.shape}")
+    if not np.isfinite(array).all():
+        first = tuple(int(index) for index in np.argwhere(~np.isfinite(array))[0])
+        raise InvalidValueError(f"{name} of shape {array.shape} holds values that are not finite (first at {first})")
+    return array.astype(np.float64)
+
+
+def _is_number(value: object, kind: type) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool | np.bool_)
+
+
+def _got(value: object) -> str:
+    return f"got {value!r} ({type(value).__name__})"

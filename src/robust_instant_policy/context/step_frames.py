@@ -1,0 +1,87 @@
+"""The numbers of a trajectory, each step of each arm in a frame of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from robust_instant_policy.context.codec import MM
+from robust_instant_policy.context.frames import WORLD, Frame, candidate_frames, choose_frames, poses_in
+from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
+from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
+
+
+@dataclass(frozen=True, eq=False)
+class StepFrames:
+    """``arms[a][t]`` is the frame in which step t of arm a is written.
+
+    The numbers of a step are, for each arm: the point between the fingertips, then the gripper point and the first
+    fingertip relative to it (millimetres, in the step's frame), and the gripper state.
+    """
+
+    arms: tuple[tuple[Frame, ...], ...]
+
+    @classmethod
+    def world(cls, num_steps: int, num_arms: int) -> StepFrames:
+        return cls(((WORLD,) * num_steps,) * num_arms)
+
+    @classmethod
+    def adaptive(cls, keypoints: FloatArray, actions: FloatArray, key_steps: Sequence[int]) -> StepFrames:
+        """The frames in which demonstrations with ``keypoints (I, K, 3)``, aligned ``actions (I, T, 10·A)``, agree
+        best; ``key_steps`` count more (see `choose_frames`)."""
+        candidates = candidate_frames(keypoints)
+        poses = poses_in(candidates, keypoints)
+        points = actions.reshape(*actions.shape[:2], -1, ACTION_DIM)[..., :STATE_INDEX]
+        points = points.reshape(*points.shape[:-1], 3, 3)
+        return cls(
+            tuple(
+                tuple(candidates[index] for index in choose_frames(candidates, poses, points[:, :, arm], key_steps))
+                for arm in range(points.shape[2])
+            )
+        )
+
+    @property
+    def num_arms(self) -> int:
+        return len(self.arms)
+
+    def poses(self, keypoints: FloatArray) -> FloatArray:
+        """Pose of each step's frame ``(T, A, 4, 4)`` in the scene of ``keypoints (K, 3)``."""
+        frames = [frame for of_step in zip(*self.arms, strict=True) for frame in of_step]
+        return poses_in(frames, keypoints[None])[:, 0].reshape(-1, self.num_arms, 4, 4)
+
+    def encode(self, keypoints: FloatArray, actions: FloatArray) -> FloatArray:
+        """The numbers ``(T, 10·A)`` of ``actions (T, 10·A)`` in the scene of ``keypoints (K, 3)``."""
+        rows = actions.reshape(len(actions), self.num_arms, ACTION_DIM).copy()
+        for poses, row in zip(self.poses(keypoints), rows, strict=True):
+            for pose, arm in zip(poses, row, strict=True):
+                gripper, left, right = transform_points(invert_pose(pose), arm[:STATE_INDEX].reshape(3, 3))
+                centre = (left + right) / 2
+                arm[:STATE_INDEX] = MM * np.concatenate([centre, gripper - centre, left - centre])
+        return rows.reshape(len(actions), -1)
+
+    def decode(self, keypoints: FloatArray, numbers: FloatArray) -> FloatArray:
+        """The inverse of `encode`, for the first ``len(numbers)`` steps."""
+        rows = numbers.reshape(len(numbers), self.num_arms, ACTION_DIM).copy()
+        for poses, row in zip(self.poses(keypoints), rows, strict=False):
+            for pose, arm in zip(poses, row, strict=True):
+                arm[:STATE_INDEX] = transform_points(pose, _points(arm / MM)).ravel()
+        return rows.reshape(len(numbers), -1)
+
+    def variation(self, numbers: FloatArray) -> FloatArray:
+        """Standard deviation ``(T,)``, metres, of a point's coordinate over the ``numbers (I, T, 10·A)``."""
+        points = _points(numbers.reshape(*numbers.shape[:2], self.num_arms, ACTION_DIM))
+        return np.sqrt(points.var(axis=0, ddof=1).mean(axis=(1, 2, 3))) / MM
+
+    def inputs(self, keypoints: FloatArray) -> FloatArray:
+        """``keypoints (K, 3)`` in each step's frame, millimetres ``(T, A, 3·K)``."""
+        poses = self.poses(keypoints)
+        shown = [MM * transform_points(invert_pose(pose), keypoints).ravel() for pose in poses.reshape(-1, 4, 4)]
+        return np.reshape(shown, (*poses.shape[:2], -1))
+
+
+def _points(numbers: FloatArray) -> FloatArray:
+    """Gripper point and fingertips ``(..., 3, 3)`` in a frame, from an arm's numbers ``(..., 10)`` in it."""
+    centre, gripper, left = np.moveaxis(numbers[..., :STATE_INDEX].reshape(*numbers.shape[:-1], 3, 3), -2, 0)
+    return np.stack([centre + gripper, centre + left, centre - left], axis=-2)

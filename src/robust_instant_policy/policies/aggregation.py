@@ -1,0 +1,94 @@
+"""From candidates to one plan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robust_instant_policy.errors import InvalidValueError, PlanningError
+from robust_instant_policy.policies.confidence import Evidence, plan_confidence
+from robust_instant_policy.policies.context import Context, LocatedScene
+from robust_instant_policy.policies.policy import Plan, Stage, Stopwatch, Usage
+from robust_instant_policy.policies.sampling import Proposal
+from robust_instant_policy.policies.settings import Settings
+from robust_instant_policy.regression import RobustTrajectory, robust_gripper_trajectory
+from robust_instant_policy.trajectory import Trajectory
+
+
+def aggregate(context: Context, scene: LocatedScene, proposal: Proposal, settings: Settings) -> Plan:
+    """The plan that follows what the candidates agree on (Oh et al. 2025, Eq. 4).
+
+    Raises `PlanningError` where candidates are no trajectories of a gripper.
+    """
+    watch = Stopwatch()
+    with watch.stage("regression"):
+        robust = agree(proposal, settings, context.prompt.curvature, context.prompt.variation)
+    # Checks of the trajectory against the demonstrations belong here; what they find is evidence, too.
+    evidence = Evidence(robust.confidence, scene.located.confidence)
+    return make_plan(context, scene, proposal, robust, plan_confidence(evidence), watch.stages)
+
+
+def take_first(context: Context, scene: LocatedScene, proposal: Proposal) -> Plan:
+    """The plan that follows the first candidate and ignores the others; it has no confidence."""
+    first, count = proposal.candidates[0], len(proposal.candidates)
+    alone = RobustTrajectory(
+        actions=first.actions,
+        times=first.times,
+        scale=np.zeros_like(first.actions),
+        weights=np.repeat(np.eye(count)[:, :1], len(first), axis=1),
+        scores=np.zeros(count),
+        hallucinated=np.zeros(count, dtype=bool),
+        onset=np.full(count, -1),
+        dimensions=((),) * count,
+        confidence=0.0,
+    )
+    return make_plan(context, scene, proposal, alone, None)
+
+
+def agree(
+    proposal: Proposal,
+    settings: Settings,
+    curvature: ArrayLike | None = None,
+    variation: ArrayLike | None = None,
+) -> RobustTrajectory:
+    """What the candidates agree on; see `robust_gripper_trajectory`."""
+    try:
+        return robust_gripper_trajectory(
+            [candidate.actions for candidate in proposal.candidates],
+            times=[candidate.times for candidate in proposal.candidates],
+            dof=settings.dof,
+            estimator=settings.estimator,
+            seed=settings.seed,
+            curvature=curvature,
+            variation=variation,
+        )
+    except InvalidValueError as error:
+        raise PlanningError(f"the answers are no trajectories of a gripper: {error}") from None
+
+
+def make_plan(
+    context: Context,
+    scene: LocatedScene,
+    proposal: Proposal,
+    chosen: RobustTrajectory,
+    confidence: float | None,
+    stages: Sequence[Stage] = (),
+) -> Plan:
+    """The whole `Plan` that follows ``chosen``; ``stages`` are those after the candidates were made."""
+    return Plan(
+        trajectory=Trajectory(chosen.actions, chosen.times),
+        candidates=proposal.candidates,
+        weights=chosen.weights,
+        scale=chosen.scale,
+        hallucinated=chosen.hallucinated,
+        onset=chosen.onset,
+        scores=chosen.scores,
+        confidence=confidence,
+        keypoints=scene.located.keypoints,
+        pixels=scene.located.pixels,
+        keypoint_confidence=scene.located.confidence,
+        usage=Usage((scene.stage, *proposal.stages, *stages)),
+        notes=(*context.notes, *scene.notes, *proposal.notes),
+    )

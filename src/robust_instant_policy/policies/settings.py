@@ -1,0 +1,91 @@
+"""All that decides a plan beside demonstrations, scene and language model, in one value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robust_instant_policy.checks import checked_positive, checked_whole
+from robust_instant_policy.context import Frames, Layout
+from robust_instant_policy.errors import InvalidValueError, UnknownNameError, UsageError
+from robust_instant_policy.regression import DEFAULT_DOF
+from robust_instant_policy.regression.gripper import ESTIMATORS
+from robust_instant_policy.trajectory import TARGET_STEPS
+
+DOWNSAMPLING = ("masked", "uniform")
+WORDS = {
+    "frames": get_args(Frames),
+    "layout": get_args(Layout),
+    "downsampling": DOWNSAMPLING,
+    "estimator": ESTIMATORS,
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Equal settings give equal plans. Hashable; raises an error that names the setting where one makes no sense.
+
+    Keypoints: ``num_keypoints`` K; ``features`` names the image descriptors; ``workspace ((x, y, z), (x, y, z))`` are
+    the lower and upper corner of what is looked at, metres, world. Trajectories: ``downsampling`` "masked" or "uniform"
+    to ``num_steps`` steps. Prompt: ``frames`` and ``layout``, see `write_prompt`. Samples: ``num_queries`` Q at
+    ``temperature``; with ``adaptive``, three at first and up to Q while the plan's confidence is low. Aggregation:
+    ``dof`` ν, infinity for the Gaussian ablation; ``estimator``, see `robust_gripper_trajectory`. ``seed`` is that of
+    the keypoints, the samples and the networks.
+    """
+
+    num_keypoints: int = 10
+    features: str = "auto"
+    workspace: tuple[tuple[float, ...], ...] | None = None
+    downsampling: str = "masked"
+    num_steps: int = TARGET_STEPS
+    frames: Frames = "adaptive"
+    layout: Layout = "factorised"
+    seed: int = 0
+    temperature: float = 0.7
+    num_queries: int = 5
+    adaptive: bool = False
+    dof: float = DEFAULT_DOF
+    estimator: str = "em"
+
+    def __post_init__(self) -> None:
+        for name, least in (("num_keypoints", 1), ("num_steps", 2), ("num_queries", 1), ("seed", 0)):
+            checked_whole(name, getattr(self, name), least)
+        checked_positive("dof", self.dof, infinite=True)
+        if self.temperature != 0:
+            checked_positive("temperature", self.temperature)
+        for name, known in WORDS.items():
+            if getattr(self, name) not in known:
+                raise UnknownNameError(name, getattr(self, name), known)
+        if self.workspace is not None:
+            object.__setattr__(self, "workspace", _corners(self.workspace))
+
+    @property
+    def of_context(self) -> Settings:
+        """These settings with what the context does not depend on at its default: equal ones give equal contexts."""
+        return self._only("num_keypoints", "features", "workspace", "downsampling", "num_steps", "frames", "layout")
+
+    @property
+    def of_samples(self) -> Settings:
+        """The same for samples of the language model, however many are asked for."""
+        return replace(self.of_context, temperature=self.temperature)
+
+    def changed(self, **options: object) -> Settings:
+        """These settings but for ``options``; raises `UsageError` for one that does not exist."""
+        known = [field.name for field in fields(self)]
+        for name in options:
+            if name not in known:
+                raise UsageError(f"unknown setting {name!r}; known: {', '.join(known)}")
+        return replace(self, **options)  # type: ignore[arg-type]
+
+    def _only(self, *names: str) -> Settings:
+        return Settings(seed=self.seed, **{name: getattr(self, name) for name in names})
+
+
+def _corners(workspace: ArrayLike) -> tuple[tuple[float, ...], ...]:
+    corners = np.asarray(workspace, dtype=np.float64)
+    if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
+        raise InvalidValueError(f"workspace must be (2, 3), lower and upper corner in metres, got {workspace!r}")
+    return tuple(tuple(map(float, corner)) for corner in corners)

@@ -1,0 +1,169 @@
+"""Policies over keypoints, on recorded demonstrations; the promise that RIP succeeds, with the embedded model."""
+
+import numpy as np
+import pytest
+
+import robust_instant_policy as rip
+from robust_instant_policy.errors import PlanningError, RipError, UsageError
+from robust_instant_policy.evaluation import scene_seed
+from robust_instant_policy.llm.model import NOBODY, Tally
+from robust_instant_policy.policies import (
+    KeypointActionTokens,
+    RobustInstantPolicy,
+    Settings,
+    build_context,
+    locate,
+)
+from robust_instant_policy.policies.confidence import Evidence, plan_confidence
+from robust_instant_policy.policies.sampling import NO_SAMPLES
+from robust_instant_policy.query import Answer
+from robust_instant_policy.tasks import make_task
+
+SETTINGS = Settings(features="efficientnet")
+
+
+class Imitator:
+    """Stands in for a language model: answers with the prompt's own examples, or with ``says``; some are ``lost``."""
+
+    name, context_length, counts_exactly = "imitator", None, False
+
+    def __init__(self, lost=(), says=None):
+        self.lost, self.says = lost, says
+        self.asked: list[int] = []
+
+    def sample(self, queries, sampling, listener=NOBODY):
+        self.asked += sampling.indices
+        tally = Tally(len(queries), sampling, listener)
+        for number, query in enumerate(queries):
+            examples = query.text.splitlines()[1:-1:2]
+            for index in set(sampling.indices) - set(self.lost):
+                tally.add(number, index, Answer(self.says or examples[index % len(examples)]))
+        return tally.answers()
+
+
+@pytest.fixture(scope="module")
+def demonstrations(workbench):
+    return rip.load_demonstrations(workbench / "data" / "push-cube")
+
+
+@pytest.fixture(scope="module")
+def context(demonstrations):
+    return build_context(demonstrations, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def observation(workbench):
+    return rip.Observation.load(workbench / "observation.npz")
+
+
+@pytest.fixture(scope="module")
+def scene(context, observation):
+    return locate(context, observation)
+
+
+def test_rip_and_rip_adaptive_succeed_with_the_embedded_model(demonstrations, observation):
+    llm = rip.connect("embedded")
+    try:
+        plan = rip.RobustInstantPolicy(llm=llm, num_queries=5, dof=1.5).fit(demonstrations).plan(observation)
+        adaptive = RobustInstantPolicy(llm, num_queries=10, adaptive=True).fit(demonstrations).plan(observation)
+    finally:
+        llm.close()
+    assert len(plan.candidates) == 5
+    assert 3 <= len(adaptive.candidates) <= 10
+    assert plan.usage.tokens > 0
+    task = make_task("push-cube")
+    try:
+        for one in (plan, adaptive):
+            task.reset(scene_seed(0, 0))
+            assert task.execute(one.trajectory).success
+    finally:
+        task.close()
+
+
+def test_methods_plan_from_the_samples_of_each_other(context, scene):
+    llm = Imitator()
+    robust, samples = (
+        RobustInstantPolicy(llm, SETTINGS, num_queries=4).fit_context(context).plan_from(scene, NO_SAMPLES)
+    )
+    tokens, _ = KeypointActionTokens(llm, SETTINGS, num_queries=3).fit_context(context).plan_from(scene, samples)
+    more, _ = RobustInstantPolicy(llm, SETTINGS, num_queries=5).fit_context(context).plan_from(scene, samples)
+    assert llm.asked == [0, 1, 2, 3, 4]
+    assert [len(plan.candidates) for plan in (robust, tokens, more)] == [4, 3, 5]
+    for one, other in zip(tokens.candidates, more.candidates, strict=False):
+        np.testing.assert_array_equal(one.actions, other.actions)
+    np.testing.assert_array_equal(tokens.trajectory.actions, tokens.candidates[0].actions)
+
+
+def test_adaptive_queries_go_on_where_an_answer_is_lost(context, scene):
+    llm = Imitator(lost=[1])
+    plan = RobustInstantPolicy(llm, SETTINGS, num_queries=6, adaptive=True).fit_context(context).plan_scene(scene)
+    assert len(plan.candidates) >= 3
+    assert llm.asked[:4] == [0, 1, 2, 3]
+    lost = Imitator(lost=[1, 2, 3, 4])
+    policy = RobustInstantPolicy(lost, SETTINGS, num_queries=6, adaptive=True).fit_context(context)
+    with pytest.raises(PlanningError, match="2 of 6 trajectories"):
+        policy.plan_scene(scene)
+
+
+def test_lost_answers_are_noted(context, scene):
+    plan = RobustInstantPolicy(Imitator(lost=[2]), SETTINGS).fit_context(context).plan_scene(scene)
+    assert len(plan.candidates) == 4
+    assert "4 of 5 answers were usable in time" in plan.notes
+
+
+def test_answers_that_cannot_be_read_are_quoted_and_silence_is_called_silence(context, scene):
+    with pytest.raises(PlanningError, match=r"I am sorry.*model"):
+        RobustInstantPolicy(Imitator(says="I am sorry"), SETTINGS).fit_context(context).plan_scene(scene)
+    with pytest.raises(PlanningError, match="give it more time"):
+        RobustInstantPolicy(Imitator(lost=range(5)), SETTINGS).fit_context(context).plan_scene(scene)
+
+
+def test_planning_before_fitting_is_refused(observation):
+    with pytest.raises(UsageError, match="fit"):
+        RobustInstantPolicy(Imitator()).plan(observation)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"num_queries": "5"},
+        {"num_queries": 0},
+        {"num_queries": True},
+        {"num_steps": 2.5},
+        {"num_keypoints": 0},
+        {"dof": float("nan")},
+        {"dof": "1"},
+        {"temperature": -1.0},
+        {"frames": "camera"},
+        {"layout": "tree"},
+        {"downsampling": "random"},
+        {"estimator": "mode"},
+        {"workspace": [[1, 1, 1], [0, 0, 0]]},
+        {"queries": 5},
+        {"deadline_s": float("nan")},
+    ],
+)
+def test_a_setting_that_makes_no_sense_is_refused_where_it_is_given(options):
+    (name,) = options
+    with pytest.raises(RipError, match=name) as caught:
+        RobustInstantPolicy(Imitator(), **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_confidence_falls_with_agreement_and_with_recognition():
+    sure = plan_confidence(Evidence(0.95, np.full(10, 0.8)))
+    assert sure == 0.95
+    assert plan_confidence(Evidence(0.5, np.full(10, 0.8))) < sure
+    assert plan_confidence(Evidence(0.95, np.full(10, 0.27))) < 0.6
+    hidden = np.where(np.arange(10) == 3, 0.0, 0.8)
+    assert plan_confidence(Evidence(0.95, hidden)) == sure
+
+
+def test_old_names_still_work_with_a_warning():
+    import robust_instant_policy.policies as policies
+
+    with pytest.warns(DeprecationWarning, match="Settings"):
+        assert policies.KeypointContext(features="efficientnet") == SETTINGS
+    with pytest.warns(DeprecationWarning, match="KeypointActionTokens"):
+        instant = policies.InstantPolicy(Imitator(), temperature=0.5)
+    assert RobustInstantPolicy(instant, num_queries=3).settings == Settings(temperature=0.5, num_queries=3)
