@@ -71,7 +71,7 @@ def examine(folder: Path) -> Iterator[Finding]:
     yield _attempt("keypoint features", _features, install_command("vision"))
     for key, needed in (
         ("OPENAI_API_KEY", "for --llm openai:…"),
-        ("RIP_API_KEY", "for other servers that ask for one"),
+        ("RIP_API_KEY", "for servers of others"),
     ):
         there = f"{key} is set" if os.environ.get(key) else f"{key} is not set; needed only {needed}"
         yield Finding(key, True, there)
