@@ -17,7 +17,7 @@ from contextlib import closing, contextmanager
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 from urllib.parse import quote
 
 import pyarrow as pa
@@ -86,16 +86,16 @@ class ResultsStore:
         make_folder(folder)
         with _explained(self.path):
             self._database = _connect(self.path, "rwc")
-            with self._transaction():
-                is_new = not _EPISODES.columns(self._database)
-                for table in (_EPISODES, _FAILURES, _INVOCATIONS):
-                    table.create(self._database)
-                self._database.execute(
-                    "CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, content TEXT NOT NULL, "
-                    "PRIMARY KEY (name, objects, assets))"
-                )
-                if is_new:
-                    self._take(_read_exports(folder))
+        with self._transaction():
+            is_new = not _EPISODES.columns(self._database)
+            for table in (_EPISODES, _FAILURES, _INVOCATIONS):
+                table.create(self._database)
+            self._database.execute(
+                "CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, content TEXT NOT NULL, "
+                "PRIMARY KEY (name, objects, assets))"
+            )
+            if is_new:
+                self._take(_read_exports(folder))
 
     def close(self) -> None:
         self._database.close()
@@ -106,13 +106,13 @@ class ResultsStore:
 
     def add(self, *rows: Episode | Failure) -> None:
         """Keep ``rows``, all or none of them; one whose key is known already is not kept twice."""
-        with _explained(self.path), self._transaction():
+        with self._transaction():
             for row in rows:
                 (_EPISODES if isinstance(row, Episode) else _FAILURES).insert(self._database, row)
 
     def note(self, manifest: Manifest) -> None:
         """Add the suites and commands of ``manifest``; suites of one name and the same objects become one."""
-        with _explained(self.path), self._transaction():
+        with self._transaction():
             self._take(Results(manifest=manifest))
 
     @contextmanager
@@ -156,14 +156,17 @@ class ResultsStore:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        self._database.execute("BEGIN IMMEDIATE")
-        try:
+        with _explained(self.path), self._database:  # commits, or takes back
+            self._database.execute("BEGIN IMMEDIATE")
             yield
-            self._database.execute("COMMIT")
-        except BaseException:
-            if self._database.in_transaction:  # a full disk may have ended it already
-                self._database.execute("ROLLBACK")
-            raise
+
+
+class _Column(NamedTuple):
+    """``default`` is MISSING where the column must be there."""
+
+    kind: type
+    may_be_empty: bool
+    default: Any
 
 
 class _Table:
@@ -171,16 +174,15 @@ class _Table:
 
     def __init__(self, name: str, kind: type, key: Iterable[str]):
         self._name, self._kind = name, kind
-        self._hints = _flat_hints(kind)
-        self._defaults = _flat_defaults(kind)
+        self._columns = _columns_of(kind)
+        self._defaults = {name: one.default for name, one in self._columns.items() if one.default is not MISSING}
         self._key = list(key)
-        names = list(self._hints)
-        marks = ", ".join(f":{column}" for column in names)
-        self._insert = f"INSERT OR IGNORE INTO {name} ({', '.join(names)}) VALUES ({marks})"
+        marks = ", ".join(f":{column}" for column in self._columns)
+        self._insert = f"INSERT OR IGNORE INTO {name} ({', '.join(self._columns)}) VALUES ({marks})"
 
     def create(self, database: sqlite3.Connection) -> None:
         """Make the table, or add the columns that came after an older version made it."""
-        columns = {column: _SQL_TYPES[hint] for column, (hint, _) in self._hints.items()}
+        columns = {column: _SQL_TYPES[one.kind] for column, one in self._columns.items()}
         known = self.columns(database)
         if not known:
             database.execute(f"CREATE TABLE {self._name} ({', '.join(map(' '.join, columns.items()))})")
@@ -191,7 +193,9 @@ class _Table:
                 database.execute(f"UPDATE {self._name} SET {column} = ?", (self._defaults[column],))
             database.execute(f"DROP INDEX IF EXISTS {self._name}_key")
         # SQLite takes no two NULL for the same
-        key = ", ".join(f"IFNULL({column}, '')" if self._hints[column][1] else column for column in self._key)
+        key = ", ".join(
+            f"IFNULL({column}, '')" if self._columns[column].may_be_empty else column for column in self._key
+        )
         database.execute(f"CREATE UNIQUE INDEX IF NOT EXISTS {self._name}_key ON {self._name} ({key})")
 
     def columns(self, database: sqlite3.Connection) -> set[str]:
@@ -208,7 +212,7 @@ class _Table:
             yield self._row(self._defaults | dict(zip(known, values, strict=True)))
 
     def arrow(self, rows: Iterable[Any]) -> pa.Table:
-        schema = pa.schema([(column, _ARROW_TYPES[hint]) for column, (hint, _) in self._hints.items()])
+        schema = pa.schema([(column, _ARROW_TYPES[one.kind]) for column, one in self._columns.items()])
         return pa.Table.from_pylist([_flat(row) for row in rows], schema=schema)
 
     def read_parquet(self, path: Path) -> Iterator[Any]:
@@ -224,40 +228,31 @@ class _Table:
             yield self._row(self._defaults | values)
 
     def _check(self, known: set[str], where: Path | str = RESULTS_FILE) -> None:
-        if known - set(self._hints) or set(self._hints) - known - set(self._defaults):
+        if known - self._columns.keys() or self._columns.keys() - known - self._defaults.keys():
             raise DatasetError(
                 f"{where} has other columns than this version writes; move it away and run again with --replay, "
                 "which makes its rows anew from the stored samples"
             )
 
     def _row(self, values: dict[str, Any]) -> Any:
-        for column, (hint, _) in self._hints.items():
-            if hint is bool and values[column] is not None:
+        for column, one in self._columns.items():
+            if one.kind is bool and values[column] is not None:
                 values[column] = bool(values[column])
         return _build(self._kind, values)
 
 
-def _flat_hints(kind: type) -> dict[str, tuple[type, bool]]:
-    """Type of each column, and whether it may be empty."""
-    found: dict[str, tuple[type, bool]] = {}
-    for name, hint in get_type_hints(kind).items():
-        if is_dataclass(hint):
-            found |= _flat_hints(hint)  # type: ignore[arg-type]
-        else:
-            found[name] = next((one, hint != one) for one in _SQL_TYPES if hint in (one, one | None))
-    return found
-
-
-def _flat_defaults(kind: type) -> dict[str, Any]:
-    """The columns that need not be there, with the value that they then have."""
+def _columns_of(kind: type) -> dict[str, _Column]:
+    """One for each field of ``kind`` and of the dataclasses in it."""
     hints = get_type_hints(kind)
-    known: dict[str, Any] = {}
+    found: dict[str, _Column] = {}
     for one in fields(kind):
-        if is_dataclass(hints[one.name]):
-            known |= _flat_defaults(hints[one.name])
-        elif one.default is not MISSING:
-            known[one.name] = one.default
-    return known
+        hint = hints[one.name]
+        if is_dataclass(hint):
+            found |= _columns_of(hint)  # type: ignore[arg-type]
+        else:
+            plain = next(known for known in _SQL_TYPES if hint in (known, known | None))
+            found[one.name] = _Column(plain, hint != plain, one.default)
+    return found
 
 
 def _flat(row: Any) -> dict[str, Any]:
@@ -276,10 +271,10 @@ def _build(kind: Any, values: dict[str, Any]) -> Any:
     )
 
 
-_KEY = (*_flat_hints(Scene), *_flat_hints(Variant), "candidate")
+_KEY = (*_columns_of(Scene), *_columns_of(Variant), "candidate")
 _EPISODES = _Table("episodes", Episode, _KEY)
 _FAILURES = _Table("failures", Failure, _KEY)
-_INVOCATIONS = _Table("invocations", Invocation, _flat_hints(Invocation))
+_INVOCATIONS = _Table("invocations", Invocation, _columns_of(Invocation))
 
 
 def _read(database: sqlite3.Connection) -> Results:
