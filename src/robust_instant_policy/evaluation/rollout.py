@@ -45,7 +45,7 @@ def roll_out(
     Every execution starts from a fresh build of the scene; those numbered in ``done`` are left out. A plan that cannot
     be made, or that the arm refuses, is a failed episode, not an error.
     """
-    row = partial(Episode, scene=scene, variant=variant)
+    row = partial(Episode, scene=scene, variant=variant, candidate=0, candidates=1, tokens=0, confidence=None)
     if isinstance(policy, ClosedLoopPolicy):
         yield _follow(task, policy, observation, row)
         return
@@ -54,14 +54,10 @@ def roll_out(
         plan = policy.plan(observation)
     except (GeometryError, KeypointError, PlanningError) as error:
         yield row(
-            candidate=0,
-            candidates=1,
             success=False,
             seconds=time.perf_counter() - start,
             physics_seconds=0.0,
             executed_seconds=0.0,
-            tokens=0,
-            confidence=None,
             failure=f"no plan: {error}",
         )
         return
@@ -97,14 +93,10 @@ def _follow(task: Task, policy: ClosedLoopPolicy, observation: Observation, row:
     controller = _Timed(policy.controller(observation))
     execution = task.follow(controller, policy.max_seconds)
     return row(
-        candidate=0,
-        candidates=1,
         success=execution.success,
         seconds=controller.seconds,
         physics_seconds=time.perf_counter() - start - controller.seconds,
         executed_seconds=execution.seconds,
-        tokens=0,
-        confidence=None,
         failure=execution.failure,
     )
 

@@ -73,29 +73,30 @@ class Workbench:
     def run(self, work: SceneWork) -> Iterator[Outcome]:
         """Everything that is to be done in one scene: first all executions, then failed episodes are taken apart."""
         task = self._enter(work.scene)
-        shown = self._show(work)
+        self._show(work)
         observation = task.reset(work.scene.seed)
         self._located.clear()
         self._samples.clear()
         failed = list(work.failed)
         for variant in work.variants:
             done = {candidate for scene, other, candidate in work.done if (scene, other) == (work.scene, variant)}
-            policy = self._policy(variant, shown)
+            policy = self._policy(variant)
             for episode in roll_out(task, policy, observation, work.scene, variant, done):
                 yield episode
                 if not episode.success:
                     failed.append(episode)
         for variant in work.plans:
-            policy = self._policy(variant, shown)
+            policy = self._policy(variant)
             if isinstance(policy, RememberingPolicy):
                 with suppress(KeypointError, PlanningError):
                     yield Planned(work.scene, variant, policy.plan(observation))
-        yield from self._take_apart(task, work.scene, failed, shown, observation)
+        yield from self._take_apart(task, work.scene, failed, observation)
 
     def train(self, work: SceneWork, variant: Variant) -> TrainedPolicy:
         """Make and train the policy of ``variant`` for the scenes of ``work``, as `run` would."""
         self._enter(work.scene)
-        policy = self._policy(variant, self._show(work))
+        self._show(work)
+        policy = self._policy(variant)
         return cast("TrainedPolicy", policy.policy if isinstance(policy, RememberingPolicy) else policy)
 
     def close(self) -> None:
@@ -133,11 +134,10 @@ class Workbench:
         self._located: dict[ContextKey, LocatedScene] = {}  # these two of the present scene
         self._samples: dict[ContextKey, Samples] = {}
 
-    def _show(self, work: SceneWork) -> list[Demonstration]:
+    def _show(self, work: SceneWork) -> None:
         if len(self._shown) < work.demos:
             self._forget()
             self._shown = self._demonstrations(work.scene.task, work.demos)
-        return self._shown
 
     def _read_demonstrations(self, task: str, count: int, with_images: bool = False) -> list[Demonstration]:
         folder = demonstrations_folder(self._setup.data, task, with_images)
@@ -170,7 +170,7 @@ class Workbench:
             settings = settings.changed(frames=variant.frames, layout=variant.layout)
         return settings if variant.dof is None else settings.changed(dof=variant.dof)
 
-    def _policy(self, variant: Variant, shown: Sequence[Demonstration]) -> RememberingPolicy | ClosedLoopPolicy:
+    def _policy(self, variant: Variant) -> RememberingPolicy | ClosedLoopPolicy:
         if variant not in self._policies:
             training = None
             if variant.steps is not None:
@@ -187,12 +187,7 @@ class Workbench:
         return self._policies[variant]
 
     def _take_apart(
-        self,
-        task: Task,
-        scene: Scene,
-        failed: Sequence[Episode],
-        shown: Sequence[Demonstration],
-        observation: Observation,
+        self, task: Task, scene: Scene, failed: Sequence[Episode], observation: Observation
     ) -> Iterator[Analysis]:
         analysis = FailureAnalysis(task, scene)
         truths: dict[ContextKey, Truth | None] = {}
@@ -200,13 +195,13 @@ class Workbench:
         def truth(demos: int, settings: Settings) -> Truth | None:
             key = demos, settings.of_context
             if key not in truths:
-                known = self._truth_of_demonstrations(scene.task, shown, demos)
+                known = self._truth_of_demonstrations(demos)
                 context = self.context(demos, settings)
                 truths[key] = None if known is None else true_keypoints(task, scene.seed, context, known)
             return truths[key]
 
         for episode in failed:
-            policy, demos = self._policy(episode.variant, shown), episode.variant.demos
+            policy, demos = self._policy(episode.variant), episode.variant.demos
             settings = self._settings(episode.variant)
             try:
                 failure = analysis.examine(episode, policy, observation, partial(truth, demos, settings))
@@ -217,15 +212,15 @@ class Workbench:
             task.reset(scene.seed)
             yield Analysis(failure, film(task, policy, observation, episode.candidate) if self._setup.films else b"")
 
-    def _truth_of_demonstrations(
-        self, task_name: str, shown: Sequence[Demonstration], demos: int
-    ) -> list[SceneTruth] | None:
+    def _truth_of_demonstrations(self, demos: int) -> list[SceneTruth] | None:
         """Of each demonstration that is shown; None where one was not recorded in a scene that can be drawn again."""
-        seeds = [demonstration.seed for demonstration in shown[:demos] if demonstration.seed is not None]
-        if len(seeds) < len(shown[:demos]):
+        shown = self._shown[:demos]
+        seeds = [demonstration.seed for demonstration in shown if demonstration.seed is not None]
+        if len(seeds) < len(shown):
             return None
         if len(self._shown_truth) < demos:
-            apart = None if self._place[1] == "seen" else make_task(task_name, assets=self._place[2])
+            name, objects, assets = self._place
+            apart = None if objects == "seen" else make_task(name, assets=assets)
             task = apart or self._task
             assert task is not None
             try:
