@@ -83,7 +83,8 @@ def test_more_successes_than_trials_are_refused():
 
 
 def test_the_t_test_gives_the_marks_that_the_paper_prints_for_its_own_table():
-    for method, marks in paper.TABLE1_MARKS.items():
+    printed = {"dp": "**", "kat-dp": "*", "kat": "*", "rip-gauss": "", "rip": ""}
+    for method, marks in printed.items():
         assert mark(t_test(paper.TABLE1["rip"], paper.TABLE1[method])) == marks, method
 
 

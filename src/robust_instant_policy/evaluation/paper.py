@@ -14,13 +14,10 @@ TABLE1 = {
     "rip-gauss": (40, 70, 50, 90, 90, 70, 60, 60, 40, 70),
     "rip": (60, 100, 70, 100, 90, 100, 90, 70, 50, 70),
 }
-TABLE1_MARKS = {"dp": "**", "kat-dp": "*", "kat": "*", "rip-gauss": "", "rip": ""}
 # Sec. V-B.2, over the five tasks with gripper actions: normal and gripper-based downsampling.
 DOWNSAMPLING = {"uniform": 52, "masked": 74}
 
 
 def table1(method: str, task: str) -> int | None:
     """The paper's success rate in percent; None where it has none."""
-    if method not in TABLE1 or task not in TABLE1_TASKS:
-        return None
-    return TABLE1[method][TABLE1_TASKS.index(task)]
+    return dict(zip(TABLE1_TASKS, TABLE1[method], strict=True)).get(task) if method in TABLE1 else None

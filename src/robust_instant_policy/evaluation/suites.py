@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from robust_instant_policy.errors import UnknownNameError, UsageError
+from robust_instant_policy.evaluation.paper import TABLE1_TASKS
 from robust_instant_policy.evaluation.scenes import scene_seed
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.policies import METHOD_NAMES
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.tasks import TASK_NAMES
 
-SIMULATION_TASKS = ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")
-ALOHA_TASKS = ("aloha-pick-banana", "aloha-hang", "aloha-sweep", "aloha-pick-place", "aloha-cup-upright")
+SIMULATION_TASKS = TABLE1_TASKS[:5]
 # "tasks in which gripper actions were essential"
 GRIPPER_TASKS = ("pick-banana", "aloha-pick-banana", "aloha-hang", "aloha-pick-place", "aloha-cup-upright")
 DEMOS = (1, 3, 5, 10, 20)
@@ -91,70 +91,44 @@ class Choice:
     steps: int = DEFAULT_STEPS
 
 
-def make_suite(name: str, choice: Choice) -> Suite:
-    """The analysis called ``name``, one of `SUITE_NAMES`; raises `UnknownNameError` for others."""
-    if name not in _SUITES:
-        raise UnknownNameError("suite", name, (*SUITE_NAMES, "all"))
-    tasks, variants = _SUITES[name](choice)
-    if not tasks:
-        raise UsageError(f"none of the chosen tasks is one that suite {name} is about")
-    seeds = tuple(scene_seed(choice.seed, index) for index in range(choice.num_scenes))
-    return Suite(name, tuple(tasks), tuple(dict.fromkeys(variants)), seeds, choice.objects, choice.assets)
-
-
 def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:
-    """The analyses called ``names``, of which "all" stands for every one."""
+    """The analyses called ``names``, of which "all" stands for every one; raises `UnknownNameError` for others."""
     wanted = [one for name in names for one in (SUITE_NAMES if name == "all" else (name,))]
-    return [make_suite(name, choice) for name in dict.fromkeys(wanted)]
-
-
-def _tasks(choice: Choice, of_paper: Sequence[str]) -> list[str]:
-    return list(choice.tasks) if choice.tasks else [task for task in of_paper if task in TASK_NAMES]
+    seeds = tuple(scene_seed(choice.seed, index) for index in range(choice.num_scenes))
+    suites = []
+    for name in dict.fromkeys(wanted):
+        if name not in _SUITES:
+            raise UnknownNameError("suite", name, (*SUITE_NAMES, "all"))
+        tasks, variants = _SUITES[name](choice)
+        if not tasks:
+            raise UsageError(f"none of the chosen tasks is one that suite {name} is about")
+        suites.append(Suite(name, tuple(tasks), tuple(dict.fromkeys(variants)), seeds, choice.objects, choice.assets))
+    return suites
 
 
 def _methods(choice: Choice, default: Sequence[str] = METHOD_NAMES) -> list[Variant]:
     return [replace(choice.base, method=method, steps=choice.steps) for method in choice.methods or default]
 
 
-def _table1(choice: Choice) -> tuple[list[str], list[Variant]]:
-    return _tasks(choice, (*SIMULATION_TASKS, *ALOHA_TASKS)), _methods(choice)
-
-
-def _demos(choice: Choice) -> tuple[list[str], list[Variant]]:
-    variants = [replace(variant, demos=demos) for variant in _methods(choice) for demos in DEMOS]
-    return _tasks(choice, SIMULATION_TASKS), variants
-
-
-def _queries(choice: Choice) -> tuple[list[str], list[Variant]]:
-    base = replace(choice.base, demos=HYPERPARAMETER_DEMOS)
-    return _tasks(choice, SIMULATION_TASKS), [replace(base, queries=queries) for queries in QUERIES]
-
-
-def _dof(choice: Choice) -> tuple[list[str], list[Variant]]:
-    base = replace(choice.base, demos=HYPERPARAMETER_DEMOS)
-    return _tasks(choice, SIMULATION_TASKS), [replace(base, dof=dof) for dof in DOFS]
-
-
-def _downsampling(choice: Choice) -> tuple[list[str], list[Variant]]:
-    tasks = [task for task in _tasks(choice, GRIPPER_TASKS) if task in GRIPPER_TASKS]
-    return tasks, [replace(choice.base, downsampling=way) for way in ("uniform", "masked")]
-
-
-def _trajectories(choice: Choice) -> tuple[list[str], list[Variant]]:
-    return _tasks(choice, ("push-cube",)), _methods(choice, SAMPLING_METHODS)
-
-
-def _chosen(choice: Choice) -> tuple[list[str], list[Variant]]:
-    return list(choice.tasks or ("push-cube",)), _methods(choice, SAMPLING_METHODS)
-
-
-_SUITES = {
-    CHOSEN: _chosen,
-    "table1": _table1,
-    "demos": _demos,
-    "queries": _queries,
-    "dof": _dof,
-    "downsampling": _downsampling,
-    "trajectories": _trajectories,
+_SUITES: dict[str, Callable[[Choice], tuple[Sequence[str], list[Variant]]]] = {
+    CHOSEN: lambda choice: (choice.tasks or ("push-cube",), _methods(choice, SAMPLING_METHODS)),
+    "table1": lambda choice: (choice.tasks or TABLE1_TASKS, _methods(choice)),
+    "demos": lambda choice: (
+        choice.tasks or SIMULATION_TASKS,
+        [replace(variant, demos=demos) for variant in _methods(choice) for demos in DEMOS],
+    ),
+    "queries": lambda choice: (
+        choice.tasks or SIMULATION_TASKS,
+        [replace(choice.base, demos=HYPERPARAMETER_DEMOS, queries=queries) for queries in QUERIES],
+    ),
+    "dof": lambda choice: (
+        choice.tasks or SIMULATION_TASKS,
+        [replace(choice.base, demos=HYPERPARAMETER_DEMOS, dof=dof) for dof in DOFS],
+    ),
+    "downsampling": lambda choice: (
+        [task for task in choice.tasks or GRIPPER_TASKS if task in GRIPPER_TASKS],
+        [replace(choice.base, downsampling=way) for way in ("uniform", "masked")],
+    ),
+    "trajectories": lambda choice: (choice.tasks or ("push-cube",), _methods(choice, SAMPLING_METHODS)),
 }
 SUITE_NAMES = tuple(name for name in _SUITES if name != CHOSEN)

@@ -98,6 +98,10 @@ def values(variants: Sequence[Variant], value: Callable[[Variant], str]) -> list
     return told if len(set(told)) == len(told) else labels(variants)
 
 
+def dof_symbol(variant: Variant) -> str:
+    return "∞" if variant.dof is None or math.isinf(variant.dof) else f"{variant.dof:g}"
+
+
 def by_demos(variants: Sequence[Variant]) -> dict[str, dict[int, Variant]]:
     """Those that differ in nothing but how much is shown, together: label, then number of demonstrations."""
     groups: dict[Variant, dict[int, Variant]] = {}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import fmean
 from textwrap import fill
 
@@ -19,7 +19,7 @@ from matplotlib.patches import Patch
 
 from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.statistics import Summary
-from robust_instant_policy.evaluation.variant import Scene, Variant, by_demos, labels, values
+from robust_instant_policy.evaluation.variant import Scene, Variant, by_demos, dof_symbol, labels, values
 from robust_instant_policy.policies import Plan
 
 AVERAGE = "average"
@@ -63,6 +63,8 @@ STYLES = {
 }
 PLAIN = Style("#808080", "-/", "*", (0, (1, 2)))
 
+Told = Callable[[Variant, str], float | None]  # the paper's number in percent for a variant in a task, or on average
+
 
 def draw(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan]) -> Figure:
     """The figure of a suite; ``plans`` are those it kept."""
@@ -88,16 +90,16 @@ def _success_bars(summary: Summary) -> Figure:
     styles = [_style(variant) for variant in summary.variants]
     for row in range(num_rows):
         axes = figure.add_subplot(num_rows, 1, row + 1)
-        _bars(axes, summary, groups[bounds[row] : bounds[row + 1]], styles)
+        _bars(axes, summary, groups[bounds[row] : bounds[row + 1]], styles, partial(_paper_percent, summary))
         if row == 0:
             told = any(variant.method in paper.TABLE1 for variant in summary.variants)
             _legend_above(axes, styles, labels(summary.variants), "paper, with GPT-4o" if told else "", 4)
     return figure
 
 
-def _bars(axes: Axes, summary: Summary, groups: Sequence[str], styles: Sequence[Style]) -> None:
+def _bars(axes: Axes, summary: Summary, groups: Sequence[str], styles: Sequence[Style], told: Told) -> None:
     """One group of bars for each of ``groups``, tasks or their average; whiskers are Wilson's 95% interval, over tasks
-    ± 1 sd.
+    ± 1 sd; lines are the paper's numbers.
     """
     width = 0.84 / len(summary.variants)
     for index, (variant, style) in enumerate(zip(summary.variants, styles, strict=True)):
@@ -122,9 +124,8 @@ def _bars(axes: Axes, summary: Summary, groups: Sequence[str], styles: Sequence[
             )
             whisker = 100 * np.array([[max(0.0, mean - low)], [max(0.0, high - mean)]])
             axes.errorbar(place + offset, 100 * mean, whisker, color="black", linewidth=0.7, capsize=1.5)
-            told = _paper_percent(summary, variant, task)
-            if told is not None and summary.suite.name != "downsampling":
-                _told(axes, place + offset, width, told)
+            if (percent := told(variant, task)) is not None:
+                _told(axes, place + offset, width, percent)
     room = max(8, LINE_CHARACTERS // len(groups))  # names break at their hyphens
     axes.set_xticks(range(len(groups)), [fill(group, room) for group in groups])
     _success_axis(axes)
@@ -210,11 +211,11 @@ def _downsampling(summary: Summary) -> Figure:
     names = {"uniform": "normal (uniform)", "masked": "gripper-based (masked)"}
     groups = [*summary.tasks, AVERAGE]
     styles = [looks[way] for way in ways]
-    _bars(axes, summary, groups, styles)
-    width = 0.84 / len(ways)
-    for index, way in enumerate(ways):
-        centre = len(summary.tasks) + (index - (len(ways) - 1) / 2) * width
-        _told(axes, centre, width, paper.DOWNSAMPLING[way])
+
+    def told(variant: Variant, group: str) -> float | None:
+        return paper.DOWNSAMPLING[variant.downsampling] if group == AVERAGE else None
+
+    _bars(axes, summary, groups, styles, told)
     _legend_above(axes, styles, [names[way] for way in ways], "paper, average of 5 tasks", 2)
     return figure
 
@@ -273,15 +274,11 @@ def _style(variant: Variant) -> Style:
     return STYLES.get(variant.method, PLAIN)
 
 
-def _dof_label(variant: Variant) -> str:
-    return "∞" if variant.dof is None or math.isinf(variant.dof) else f"{variant.dof:g}"
-
-
 _FIGURES: dict[str, Callable[[Summary], Figure]] = {
     "chosen": _success_bars,
     "table1": _success_bars,
     "demos": _demos,
     "queries": lambda summary: _sweep(summary, "queries Q", lambda variant: str(variant.queries)),
-    "dof": lambda summary: _sweep(summary, "degrees of freedom ν", _dof_label),
+    "dof": lambda summary: _sweep(summary, "degrees of freedom ν", dof_symbol),
     "downsampling": _downsampling,
 }

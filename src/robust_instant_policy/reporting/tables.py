@@ -11,8 +11,16 @@ from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import STAGES, Failure
 from robust_instant_policy.evaluation.manifest import Invocation
-from robust_instant_policy.evaluation.statistics import Rate, Summary, mark, paired_test, reference, t_test
-from robust_instant_policy.evaluation.variant import Variant, by_demos, labels, values
+from robust_instant_policy.evaluation.statistics import (
+    Rate,
+    Summary,
+    mark,
+    mean_and_deviation,
+    paired_test,
+    reference,
+    t_test,
+)
+from robust_instant_policy.evaluation.variant import Variant, by_demos, dof_symbol, labels, values
 from robust_instant_policy.policies import METHOD_NAMES
 
 NONE = "–"
@@ -49,7 +57,8 @@ def success_table(summary: Summary) -> Table:
         for task in summary.tasks:
             row.append(_cell(summary.rate(variant, task), summary.best(task)))
             if task in told:
-                row.append(_percent(paper.table1(variant.method, task)))
+                percent = paper.table1(variant.method, task)
+                row.append(NONE if percent is None else str(percent))
         stars = ""
         if ours is not None and variant != ours:
             own, others = _both(summary, ours, variant)
@@ -202,17 +211,9 @@ def _spread(summary: Summary, variant: Variant, stars: str = "") -> str:
     return f"{100 * mean:.1f}{stars.replace('*', chr(92) + '*')} ± {100 * deviation:.1f}"
 
 
-def _percent(value: int | None) -> str:
-    return NONE if value is None else str(value)
-
-
 def _paper_average(variant: Variant, tasks: Sequence[str]) -> str:
-    values = [value for task in tasks if (value := paper.table1(variant.method, task)) is not None]
-    if not values:
-        return NONE
-    mean = sum(values) / len(values)
-    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / len(values))
-    return f"{mean:.0f} ± {deviation:.0f}"
+    rates = [rate for task in tasks if (rate := paper.table1(variant.method, task)) is not None]
+    return "{:.0f} ± {:.0f}".format(*mean_and_deviation(rates)) if rates else NONE
 
 
 def _executions(summary: Summary, variant: Variant) -> str:
@@ -246,16 +247,12 @@ def _downsampling(summary: Summary) -> list[Table]:
     return [Table(table.head, (*table.rows, row), table.note)]
 
 
-def _dof(variant: Variant) -> str:
-    return "∞" if variant.dof is None or math.isinf(variant.dof) else f"{variant.dof:g}"
-
-
 _TABLES: dict[str, Callable[[Summary], list[Table]]] = {
     "chosen": _with_tests,
     "table1": _with_tests,
     "demos": lambda summary: [demos_table(summary)],
     "queries": lambda summary: [sweep_table(summary, "Q", lambda variant: str(variant.queries))],
-    "dof": lambda summary: [sweep_table(summary, "ν", _dof)],
+    "dof": lambda summary: [sweep_table(summary, "ν", dof_symbol)],
     "downsampling": _downsampling,
     "trajectories": lambda summary: [],
 }
