@@ -120,7 +120,6 @@ def write_report(folder: str | Path) -> Path:
         candidates=_candidate_table(plan),
         weights=chart(weights_over_time(plan)) if plan.candidates else "",
         dimensions=chart(dimensions_over_time(plan)),
-        record_confidence=plan.confidence is not None,
         confidence=_confidence_table(plan),
         notes=plan.notes,
         stages=_stage_table(record.stages),
