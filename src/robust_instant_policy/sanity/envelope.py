@@ -18,6 +18,7 @@ TURN_FACTOR, TURN_MARGIN_RAD = 1.5, np.deg2rad(25.0)  # on the largest demonstra
 TILT_MARGIN_RAD = np.deg2rad(25.0)  # on how far the approach leaned away from its mean direction
 SIDE_FACTOR, SIDE_MARGIN_M = 0.15, 0.005  # on the sides of the gripper's triangle
 LENGTH_FACTOR = 2.0  # on the longest demonstrated path
+DEGREES = 180 / np.pi  # in a radian
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,14 +85,9 @@ class Envelope:
             found += self._check_arm(thinned, arm, stretch, f"arm {arm + 1}: " if arms > 1 else "")
         if (changes := gripper_changes(trajectory)) not in self.changes:
             told = " or ".join(sorted(map(_in_words, self.changes))[:3])
-            found.append(
-                _outside(
-                    "gripper changes",
-                    f"the plan's gripper goes {_in_words(changes)}, demonstrated was {told}",
-                    sum(len(c) - 1 for c in changes),
-                    max(sum(len(c) - 1 for c in known) for known in self.changes),
-                )
-            )
+            words = f"the plan's gripper goes {_in_words(changes)}, demonstrated was {told}"
+            most = max(sum(map(len, known)) for known in self.changes)
+            found.append(_outside("gripper changes", words, sum(map(len, changes)) - arms, most - arms))
         return tuple(found)
 
     def require(self, trajectory: Trajectory) -> None:
@@ -101,52 +97,45 @@ class Envelope:
 
     def _check_arm(self, trajectory: Trajectory, arm: int, stretch: float, name: str) -> list[Finding]:
         points = trajectory.triplets[:, arm]  # (T, 3, 3)
-        found = []
-        beyond = np.maximum(self.lower[arm] - points, points - self.upper[arm]).max(axis=(1, 2))
-        if beyond.max() > 0:
-            step = int(beyond.argmax())
-            excess, limit = beyond[step] + POSITION_MARGIN_M, POSITION_MARGIN_M
-            words = f"{name}position of step {step} lies {excess:.2f} m outside what was demonstrated"
-            found.append(_outside("position", f"{words}, {limit:.2f} m allowed", excess, limit, step))
-        heights = (points[:, 1:] @ self.plane[:3] + self.plane[3]).min(axis=1)
-        if heights.min() < self.lowest[arm]:
+        lengths = step_lengths(trajectory)[:, arm]
+        found: list[Finding] = []
+
+        def bound(kind: str, values: FloatArray, limit: float, words: str, unit: float = 1.0) -> None:
+            """Report the step with the largest of ``values`` where it exceeds ``limit``."""
+            if len(values) and values.max() > limit:
+                step = int(values.argmax())
+                told = words.format(step=step, next=step + 1, value=unit * values[step], limit=unit * limit)
+                found.append(_outside(kind, name + told, values[step], limit, step))
+
+        outside = np.maximum(self.lower[arm] - points, points - self.upper[arm]).max(axis=(1, 2)) + POSITION_MARGIN_M
+        words = "position of step {step} lies {value:.2f} m outside what was demonstrated, {limit:.2f} m allowed"
+        bound("position", outside, POSITION_MARGIN_M, words)
+        heights, lowest = (points[:, 1:] @ self.plane[:3] + self.plane[3]).min(axis=1), self.lowest[arm]
+        if heights.min() < lowest:
             step = int(heights.argmin())
             words = f"{name}a fingertip is {heights[step] * 1e3:.0f} mm above the table at step {step}, too low"
-            limit = self.lowest[arm]
-            found.append(_outside("height", f"{words}: {limit * 1e3:.0f} mm allowed", heights[step], limit, step))
-        lengths = step_lengths(trajectory)[:, arm]
-        if len(lengths) and lengths.max() > (limit := self.step[arm] * stretch):
-            step = int(lengths.argmax())
-            words = f"{name}the gripper moves {lengths[step]:.2f} m from step {step} to {step + 1}"
-            found.append(_outside("step length", f"{words}, {limit:.2f} m allowed", lengths[step], limit, step))
-        turns = step_turns(trajectory)[:, arm]
-        if len(turns) and turns.max() > (limit := self.turn[arm] * stretch):
-            step = int(turns.argmax())
-            words = f"{name}the gripper turns {np.rad2deg(turns[step]):.0f} degrees from step {step} to {step + 1}"
-            allowed = f"{np.rad2deg(limit):.0f} degrees allowed"
-            found.append(_outside("turn", f"{words}, {allowed}", turns[step], limit, step))
+            found.append(_outside("height", f"{words}: {lowest * 1e3:.0f} mm allowed", heights[step], lowest, step))
+        words = "the gripper moves {value:.2f} m from step {step} to {next}, {limit:.2f} m allowed"
+        bound("step length", lengths, self.step[arm] * stretch, words)
+        words = "the gripper turns {value:.0f} degrees from step {step} to {next}, {limit:.0f} degrees allowed"
+        bound("turn", step_turns(trajectory)[:, arm], self.turn[arm] * stretch, words, DEGREES)
         tilts = np.arccos(np.clip(approaches(trajectory)[:, arm] @ self.approach[arm], -1, 1))
-        if tilts.max() > self.tilt[arm]:
-            step = int(tilts.argmax())
-            words = (
-                f"{name}the gripper's approach leans {np.rad2deg(tilts[step]):.0f} degrees from the demonstrated one"
-            )
-            allowed = f"{np.rad2deg(self.tilt[arm]):.0f} degrees allowed"
-            found.append(_outside("tilt", f"{words} at step {step}, {allowed}", tilts[step], self.tilt[arm], step))
+        words = (
+            "the gripper's approach leans {value:.0f} degrees from the demonstrated one at step {step}, "
+            "{limit:.0f} degrees allowed"
+        )
+        bound("tilt", tilts, self.tilt[arm], words, DEGREES)
         sides = triangle_sides(points)
         off = np.abs(sides - self.sides[arm]) - (SIDE_FACTOR * self.sides[arm] + SIDE_MARGIN_M)
         if off.max() > 0:
             step, side = (int(i) for i in np.unravel_index(int(off.argmax()), off.shape))
             value, usual = sides[step, side], self.sides[arm, side]
             what = "between the fingertips" if side == 0 else "between palm and fingertip"
-            words = (
-                f"{name}the gripper is {value * 1e3:.0f} mm {what} at step {step}, {usual * 1e3:.0f} mm demonstrated"
-            )
-            found.append(_outside("gripper shape", words, value, usual, step))
-        total = step_lengths(trajectory)[:, arm].sum()
-        if total > self.length[arm]:
-            words = f"{name}the path is {total:.2f} m long"
-            found.append(_outside("path length", f"{words}, {self.length[arm]:.2f} m allowed", total, self.length[arm]))
+            words = f"the gripper is {value * 1e3:.0f} mm {what} at step {step}, {usual * 1e3:.0f} mm demonstrated"
+            found.append(_outside("gripper shape", name + words, value, usual, step))
+        if (total := lengths.sum()) > (limit := self.length[arm]):
+            words = f"{name}the path is {total:.2f} m long, {limit:.2f} m allowed"
+            found.append(_outside("path length", words, total, limit))
         return found
 
 
@@ -185,8 +174,7 @@ def gripper_changes(trajectory: Trajectory) -> tuple[tuple[int, ...], ...]:
 
 
 def _in_words(changes: tuple[tuple[int, ...], ...]) -> str:
-    arms = ["-".join("closed" if state else "open" for state in states[:6]) for states in changes]
-    return " and ".join(arms)
+    return " and ".join("-".join("closed" if state else "open" for state in states[:6]) for states in changes)
 
 
 def _largest(values: FloatArray) -> FloatArray:

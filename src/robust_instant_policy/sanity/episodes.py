@@ -1,4 +1,4 @@
-"""Demonstrations as a set, without their images: states, rates, lengths, units, copies, and who differs."""
+"""Demonstrations as a set, without their images: states, lengths, units, copies, and who differs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ COMMON = 0.7  # share of the demonstrations that makes a rule
 
 def check_episodes(demonstrations: Sequence[Demonstration]) -> list[Finding]:
     """What is wrong with the trajectories, each by itself and beside the others."""
-    found = _rates(demonstrations) + _lengths(demonstrations)
+    found = _lengths(demonstrations)
     arms = {demonstration.trajectory.num_arms for demonstration in demonstrations}
     if len(arms) > 1:
         return [
@@ -39,15 +39,6 @@ def check_episodes(demonstrations: Sequence[Demonstration]) -> list[Finding]:
         found.append(_error("tasks", f"demonstrations of several tasks are mixed: {named}; fit one task at a time"))
     found += _states(demonstrations) + _units(demonstrations) + _copies(demonstrations)
     return found + _order_of_changes(demonstrations)
-
-
-def _rates(demonstrations: Sequence[Demonstration]) -> list[Finding]:
-    rates = np.array([demonstration.rate_hz for demonstration in demonstrations], dtype=np.float64)
-    wrong = np.flatnonzero(~(np.isfinite(rates) & (rates > 0)))
-    if not len(wrong):
-        return []
-    words = f"the recording rate of {_these(wrong)} is {rates[wrong[0]]:g} Hz; it must be positive"
-    return [_error("rate", words, rate_hz=float(rates[wrong[0]]))]
 
 
 def _lengths(demonstrations: Sequence[Demonstration]) -> list[Finding]:

@@ -31,28 +31,24 @@ class Finding:
         return f"{self.severity}: {self.message}"
 
 
-class GeometryError(RipError):
+class _FindingsError(RipError):
+    """All ``findings`` in one line."""
+
+    def __init__(self, findings: Iterable[Finding]):
+        self.findings = tuple(findings)
+        super().__init__("; ".join(finding.message for finding in self.findings))
+
+
+class GeometryError(_FindingsError):
     """Images, cameras and gripper paths that contradict each other."""
 
-    def __init__(self, findings: Iterable[Finding]):
-        self.findings = tuple(findings)
-        super().__init__("; ".join(finding.message for finding in self.findings))
 
-
-class DemonstrationError(DatasetError):
+class DemonstrationError(_FindingsError, DatasetError):
     """Demonstrations that cannot be used as they are."""
 
-    def __init__(self, findings: Iterable[Finding]):
-        self.findings = tuple(findings)
-        super().__init__("; ".join(finding.message for finding in self.findings))
 
-
-class EnvelopeError(RipError):
+class EnvelopeError(_FindingsError):
     """A plan that leaves what was demonstrated."""
-
-    def __init__(self, findings: Iterable[Finding]):
-        self.findings = tuple(findings)
-        super().__init__("; ".join(finding.message for finding in self.findings))
 
 
 def errors(findings: Iterable[Finding]) -> tuple[Finding, ...]:

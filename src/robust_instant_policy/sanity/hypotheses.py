@@ -11,24 +11,18 @@ from scipy.spatial.transform import Rotation
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, GripperTriangle, invert_pose, make_pose
 
-Correction = Callable[[Observation], Observation]
-
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """``cause`` completes "with …", ``remedy`` says what to do; ``correct`` undoes the mistake in an observation.
-
-    ``pose`` is the correction of a camera's pose alone, where that is the mistake.
-    """
+    """``cause`` completes "with …", ``remedy`` says what to do; ``correct`` undoes the mistake in an observation."""
 
     cause: str
     remedy: str
-    correct: Correction
-    pose: Callable[[FloatArray], FloatArray] | None = None
+    correct: Callable[[Observation], Observation]
 
 
 def _of_pose(cause: str, remedy: str, change: Callable[[FloatArray], FloatArray]) -> Hypothesis:
-    return Hypothesis(cause, remedy, lambda o: replace(o, camera_pose=change(o.camera_pose)), change)
+    return Hypothesis(cause, remedy, lambda o: replace(o, camera_pose=change(o.camera_pose)))
 
 
 def _of_intrinsics(cause: str, scale: tuple[float, float, float]) -> Hypothesis:

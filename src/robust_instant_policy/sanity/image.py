@@ -13,7 +13,6 @@ UNIFORM = 3.0  # of 255; a colour image that varies less shows nothing
 SQUARE_PIXELS = 0.1  # relative difference of fx and fy that no camera has
 CENTRED = 0.2  # of the image's size that the principal point may lie from its middle
 TILT_ERROR_RAD, TILT_WARNING_RAD = np.deg2rad(4.0), np.deg2rad(2.0)  # of the table against the world's z axis
-MIN_PLANE = 0.4  # share of the readings on the table's plane from which its tilt means something
 
 
 def check_image(view: View) -> list[Finding]:
@@ -22,20 +21,16 @@ def check_image(view: View) -> list[Finding]:
     found = []
     (fx, _, cx), (_, fy, cy) = observation.intrinsics[0], observation.intrinsics[1]
     height, width = observation.depth.shape
-    if fx <= 0 or fy <= 0:
-        words = f"the intrinsics have fx {fx:.4g} and fy {fy:.4g}; a negative focal length mirrors the image"
-        found.append(
-            Finding("intrinsics", "error", f"{words}: both must be positive", _k(fx, fy), "negative focal length")
-        )
-    elif abs(fx - fy) > SQUARE_PIXELS * max(fx, fy):
+    if abs(fx - fy) > SQUARE_PIXELS * max(fx, fy):
         words = f"fx {fx:.4g} and fy {fy:.4g} differ by a factor of {max(fx, fy) / min(fx, fy):.2f}: pixels are square"
-        found.append(Finding("intrinsics", "error", f"{words}; check the focal length", _k(fx, fy), "focal length"))
+        numbers = {"fx": float(fx), "fy": float(fy)}
+        found.append(Finding("intrinsics", "error", f"{words}; check the focal length", numbers, "focal length"))
     off = max(abs(cx - (width - 1) / 2) / width, abs(cy - (height - 1) / 2) / height)
     if off > CENTRED:
         words = f"the principal point ({cx:.0f}, {cy:.0f}) is far from the middle of {width}x{height} pixels"
         advice = "; are these the intrinsics of another resolution or of a crop?"
         found.append(Finding("intrinsics", "warning", words + advice, {"off_centre": off}, "principal point"))
-    readings = view.num_readings / view.depth.size
+    readings = float(np.isfinite(view.depth).mean())
     if readings < MIN_READINGS:
         words = f"{readings:.0%} of the depth image has a steady reading; check the camera's depth stream"
         return [*found, Finding("depth", "error", words, {"readings": readings})]
@@ -51,13 +46,9 @@ def check_image(view: View) -> list[Finding]:
     if view.camera_height <= 0:
         words = f"the camera lies {-view.camera_height:.2f} m below the table that it sees"
         found.append(Finding("camera pose", "error", words, {"camera_height": view.camera_height}))
-    elif view.share_on_plane >= MIN_PLANE and view.tilt > TILT_WARNING_RAD:
+    elif view.shows_table and view.tilt > TILT_WARNING_RAD:
         words = f"the table is tilted by {np.rad2deg(view.tilt):.1f} degrees in the world, whose z axis must point up"
         severity: Severity = "error" if view.tilt > TILT_ERROR_RAD else "warning"
         advice = "; the camera's pose is turned, or the depth is wrong"
         found.append(Finding("table", severity, words + advice, {"tilt": view.tilt}, "camera turned"))
     return found
-
-
-def _k(fx: float, fy: float) -> dict[str, float]:
-    return {"fx": float(fx), "fy": float(fy)}

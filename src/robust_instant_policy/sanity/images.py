@@ -28,7 +28,7 @@ from robust_instant_policy.sanity.hypotheses import reordered_quaternions
 from robust_instant_policy.sanity.image import check_image
 from robust_instant_policy.sanity.view import View
 
-PAIRED = 0.2  # by which the own images' consistency must exceed that of other images
+OWN_BETTER = 0.2  # by which the own images' consistency must exceed that of other images
 CLOSE_M = 0.015  # gap from which a path is compared with other hypotheses, too
 LOWEST_PALM_M = 0.02  # above the table
 MOSTLY = 0.8  # share of the demonstrations
@@ -37,10 +37,7 @@ UNLIKE = 0.25  # likeness below which a demonstration contradicts the others,
 ALIKE = 0.6  # where their median is at least this
 FAR_FROM_ALL_M = 0.06  # gap of a path that alone touches nothing
 LESS_CONSISTENT = 0.05  # by which the consistency under a hypothesis may be lower
-STRAIGHT_RAD, CROOKED_RAD = (
-    np.deg2rad(3.5),
-    np.deg2rad(10.0),
-)  # spread of the approach with quaternions in order, or not
+STRAIGHT_RAD, CROOKED_RAD = np.deg2rad([3.5, 10.0])  # spread of the approach with quaternions in order, or not
 
 
 def check_each_image(views: Sequence[View]) -> list[Finding]:
@@ -72,8 +69,9 @@ def check_contact(
     own, other = score, float("nan")
     if count > MIN_DEMONSTRATIONS and scene_spread(views) > ONE_SCENE_M:
         own, other = pairing_scores(views, poses)
-    exchangeable = own < other + PAIRED
-    right = today.clear >= MIN_SHARE and touches and repeats and today.level > 0 and not exchangeable
+    exchangeable = own < other + OWN_BETTER
+    is_clear, closes = today.clear >= MIN_SHARE, any(len(c.grasps) for c in today.contacts)
+    right = is_clear and touches and repeats and today.level > 0 and not exchangeable
     if right and np.mean([c.path < CLOSE_M for c in today.contacts]) >= MIN_SHARE:
         return _outliers(views, today)
     numbers = {
@@ -91,20 +89,17 @@ def check_contact(
     if explanation:
         words = f"{_measured(today)}; {_explained(explanation)}"
         # where the images do fit as they are, a hypothesis that fits better proves nothing
-        meets = touches and today.clear >= MIN_SHARE
-        severity: Severity = "warning" if right or (meets and explanation.displaced) else "error"
+        severity: Severity = "warning" if right or (touches and is_clear and explanation.displaced) else "error"
         return [Finding("contact", severity, words, numbers, explanation.cause)]
     if right:
         return _outliers(views, today)
-    if not any(view.raised.any() for view in views) and today.clear >= MIN_SHARE:
+    if is_clear and not any(view.raised.any() for view in views):
         words = "nothing in the images stands above the table: whether images and paths belong together was not checked"
-        closes = any(len(c.grasps) for c in today.contacts)
         return [Finding("contact", "warning" if closes else "unchecked", words, numbers, "flat depth: nothing raised")]
-    if today.clear < MIN_SHARE:
+    if not is_clear:
         advice = "; check the camera's pose, the depth unit and the tool's offset"
         return [Finding("contact", "error", _measured(today) + advice, numbers)]
     if not touches:
-        closes = any(len(c.grasps) for c in today.contacts)
         advice = "; check the camera's pose, the tool's offset and which image belongs to which path"
         words = _measured(today) + (advice if closes else "; nothing closes there, so it was not checked further")
         return [Finding("contact", "error" if closes else "warning", words, numbers)]

@@ -29,13 +29,7 @@ from robust_instant_policy.sanity.images import (
     object_centre,
     scene_spread,
 )
-from robust_instant_policy.sanity.scene import (
-    CALIBRATION_K,
-    CALIBRATION_M,
-    CALIBRATION_RAD,
-    check_against_scenery,
-    check_table,
-)
+from robust_instant_policy.sanity.scene import TABLE_M, check_against_scenery, check_table
 from robust_instant_policy.sanity.scenery import Scenery, camera_change
 from robust_instant_policy.sanity.view import View
 
@@ -178,9 +172,13 @@ def _check_cameras(views: Sequence[View]) -> list[Finding]:
     scenery = Scenery.of([view for view, is_same in zip(views, same, strict=True) if is_same])
     for index in (int(i) for i in np.flatnonzero(~same)):
         change = changes[index]
-        small = change.moved < CALIBRATION_M and change.turned < CALIBRATION_RAD and change.intrinsics < CALIBRATION_K
         like = scenery.likeness(views[index])
-        if not small and like.depth > 0.95 and scenery.textured and like.texture > 0.8 * scenery.texture:
+        if (
+            not change.within_calibration
+            and like.depth > 0.95
+            and scenery.textured
+            and like.texture > 0.8 * scenery.texture
+        ):
             words = f"from demonstration {index} on the camera is said to be {change}, but the picture is the same"
             numbers = {"demonstration": float(index), "moved": change.moved, "turned": change.turned}
             return [Finding("camera", "error", f"{words}: one calibration is wrong", numbers, "camera pose changed")]
@@ -189,13 +187,13 @@ def _check_cameras(views: Sequence[View]) -> list[Finding]:
 
 def _check_planes(views: Sequence[View]) -> list[Finding]:
     """The table is one plane in the world, whatever camera looks at it."""
-    known = [view for view in views if view.share_on_plane > 0.4]
+    known = [view for view in views if view.shows_table]
     if len(known) < 2:
         return []
     middle = np.nanmedian(np.concatenate([view.points.reshape(-1, 3) for view in known[:3]]), axis=0)
     heights = np.array([middle @ view.plane[:3] + view.plane[3] for view in known])
     off = float(np.abs(heights - np.median(heights)).max())
-    if off <= 0.02:
+    if off <= TABLE_M:
         return []
     words = f"the table's height differs by {off * 100:.1f} cm between demonstrations: a camera pose or depth is wrong"
     return [Finding("camera", "error", words, {"table_offset": off}, "camera pose changed")]

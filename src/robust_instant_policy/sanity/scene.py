@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from robust_instant_policy.demonstration import Observation
@@ -16,8 +14,6 @@ from robust_instant_policy.sanity.view import View
 SAME_PICTURE = 0.9  # share of the scenery's depth that must agree, of what the demonstrations' own agree
 SAME_TEXTURE = 0.5  # of the demonstrations' own correlation
 SURE_TEXTURE = 0.95  # of it, below which an image may be turned round
-CALIBRATION_M, CALIBRATION_RAD = 0.01, np.deg2rad(1.0)  # that a pose may change where the picture does not
-CALIBRATION_K = 0.03  # and the intrinsics, relatively
 TABLE_M, TABLE_RAD = 0.02, np.deg2rad(2.0)  # that the table may differ from the demonstrations'
 RESTORED = 0.6  # of the demonstrations' own correlation, that a displacement must restore
 MOVED_CLEARER = 0.1  # and by which it must be better than without
@@ -25,7 +21,6 @@ CLEARER = 0.05  # by which a correlation or share must be better to explain a pi
 MUCH_TEXTURE = 0.8  # from which texture survives another camera's resolution
 SAME_IN_WORLD = 0.3  # of the demonstrations' own correlation, of texture on the table seen by another camera
 MISSING = 0.2  # share of the scenery without depth that no camera noise explains
-MIN_PLANE = 0.4
 
 
 def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
@@ -36,7 +31,7 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
         old, new = scenery.reference.rgb.shape, observation.rgb.shape
         words = f"the image has {new[1]}x{new[0]} pixels, the demonstrations' have {old[1]}x{old[0]}"
         return [Finding("camera", "warning", f"{words}: scenery was not compared", cause="another resolution")]
-    small = change.moved < CALIBRATION_M and change.turned < CALIBRATION_RAD and change.intrinsics < CALIBRATION_K
+    small = change.within_calibration
     like = scenery.likeness(view)
     if not np.isfinite(like.depth):
         return [Finding("scenery", "unchecked", "too little of the scenery is visible to compare it")]
@@ -81,13 +76,9 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
 
 def _name_calibration(old: Observation, new: Observation, change: CameraChange) -> str:
     for hypothesis in OF_POSE:
-        if hypothesis.pose is None:
-            continue
-        corrected = replace(new, camera_pose=hypothesis.pose(new.camera_pose))
-        fixed = camera_change(old, corrected)
-        if fixed.moved < CALIBRATION_M and fixed.turned < CALIBRATION_RAD:
+        if camera_change(old, hypothesis.correct(new)).pose_within_calibration:
             return f"{hypothesis.cause} is the demonstrations'; {hypothesis.remedy}"
-    if change.intrinsics >= CALIBRATION_K:
+    if not change.intrinsics_within_calibration:
         ratio = new.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] / old.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
         told = ", ".join(f"{name} x{value:.3g}" for name, value in zip(("fx", "fy", "cx", "cy"), ratio, strict=True))
         return f"intrinsics of another camera or resolution, or a wrong focal length or principal point ({told})"
@@ -124,7 +115,7 @@ def _picture_changed(
         return Finding("scenery", "error", words + advice, numbers, "depth scale, or camera moved")
     if moved:
         cols, rows = moved
-        metres = float(np.hypot(cols, rows) * np.nanmedian(view.depth) / abs(view.observation.intrinsics[0, 0]))
+        metres = float(np.hypot(cols, rows) * np.nanmedian(view.depth) / view.observation.intrinsics[0, 0])
         words = f"the camera was moved: the scenery is displaced by {cols:+d}, {rows:+d} pixels ({metres * 100:.0f} cm)"
         advice = "; calibrate it anew, or put it back"
         return Finding("scenery", "error", words + advice, {**numbers, "shift": metres}, "camera moved")
@@ -165,7 +156,7 @@ def _shifted(view: View, scenery: Scenery, like: Likeness) -> tuple[int, int] | 
 
 def check_table(view: View, plane: FloatArray, centre: FloatArray) -> list[Finding]:
     """The table must be where the demonstrations' table is, at their ``centre (3,)``, wherever the camera is."""
-    if view.share_on_plane < MIN_PLANE:
+    if not view.shows_table:
         words = f"only {view.share_on_plane:.0%} of the image are one plane: the table's height was not checked"
         return [Finding("table", "unchecked", words, {"share_on_plane": view.share_on_plane})]
     offset = float(centre @ view.plane[:3] + view.plane[3])

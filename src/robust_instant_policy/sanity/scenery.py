@@ -16,6 +16,8 @@ from robust_instant_policy.sanity.view import View
 SAME_PLACE_M = 0.003  # two camera poses nearer than this, and
 SAME_ANGLE_RAD = 0.005  # turned by less, are one
 SAME_INTRINSICS = 0.005  # relative difference of two cameras' intrinsics that are one
+CALIBRATION_M, CALIBRATION_RAD = 0.01, np.deg2rad(1.0)  # that another calibration of one camera changes its pose,
+CALIBRATION_SHARE = 0.03  # and its intrinsics
 DEPTH_SHARE = 0.01  # of the depth by which a static pixel may differ,
 DEPTH_M = 0.006  # and at least this
 STATIC = 0.8  # share of the images that must agree on a pixel for it to be scenery
@@ -40,6 +42,18 @@ class CameraChange:
     def same(self) -> bool:
         return self.moved < SAME_PLACE_M and self.turned < SAME_ANGLE_RAD and self.intrinsics < SAME_INTRINSICS
 
+    @property
+    def pose_within_calibration(self) -> bool:
+        return self.moved < CALIBRATION_M and self.turned < CALIBRATION_RAD
+
+    @property
+    def intrinsics_within_calibration(self) -> bool:
+        return self.intrinsics < CALIBRATION_SHARE
+
+    @property
+    def within_calibration(self) -> bool:
+        return self.pose_within_calibration and self.intrinsics_within_calibration
+
     def __str__(self) -> str:
         return (
             f"{self.moved * 100:.1f} cm and {np.rad2deg(self.turned):.1f} degrees away, "
@@ -53,8 +67,8 @@ def camera_change(old: Observation, new: Observation) -> CameraChange:
     cosine = np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1)
     entries = np.array([[0, 1, 0, 1], [0, 1, 2, 2]])  # fx, fy, cx, cy
     a, b = old.intrinsics[tuple(entries)], new.intrinsics[tuple(entries)]
-    scale = np.array([abs(a[0]), abs(a[1]), old.rgb.shape[1], old.rgb.shape[0]])
-    different = float(np.max(np.abs(a - b) / np.maximum(scale, 1e-6)))
+    scale = np.array([a[0], a[1], old.rgb.shape[1], old.rgb.shape[0]])
+    different = float(np.max(np.abs(a - b) / scale))
     return CameraChange(float(np.linalg.norm(between[:3, 3])), float(np.arccos(cosine)), different)
 
 
@@ -87,6 +101,9 @@ class Likeness:
     offset: float
 
 
+UNKNOWN_LIKENESS = Likeness(*[float("nan")] * 4)
+
+
 @dataclass(frozen=True, eq=False)
 class Scenery:
     """The static background of images from one fixed camera, on the grid of `View`.
@@ -111,11 +128,11 @@ class Scenery:
         unknown = np.isnan(depths)
         depth = np.median(np.where(unknown, np.inf, depths), axis=0)
         depth[~np.isfinite(depth)] = np.nan
-        tolerance = np.maximum(DEPTH_M, DEPTH_SHARE * depth)
-        agree = (np.abs(depths - depth) < tolerance) & ~np.stack([view.raised for view in views])
+        raised = np.stack([view.raised for view in views])
+        near = np.abs(depths - depth) < np.maximum(DEPTH_M, DEPTH_SHARE * depth)
         # a raised thing that never moves, a parked arm, is scenery too
-        fixed = (np.abs(depths - depth) < tolerance).mean(axis=0) >= STATIC
-        static = fixed & ((agree.mean(axis=0) >= STATIC) | (np.stack([v.raised for v in views]).mean(axis=0) >= STATIC))
+        seldom_raised = (near & ~raised).mean(axis=0) >= STATIC
+        static = (near.mean(axis=0) >= STATIC) & (seldom_raised | (raised.mean(axis=0) >= STATIC))
         rgb = np.median(np.stack([view.rgb for view in views]), axis=0).astype(np.float32)
         # shadows and flat things move with the objects
         change = np.abs(np.stack([view.rgb for view in views]) - rgb).max(axis=-1)
@@ -135,11 +152,11 @@ class Scenery:
     def likeness(self, view: View) -> Likeness:
         """Of ``view`` where the scenery is not hidden by what stands on the table."""
         if view.depth.shape != self.depth.shape:
-            return Likeness(float("nan"), float("nan"), float("nan"), float("nan"))
+            return UNKNOWN_LIKENESS
         tolerance = np.maximum(DEPTH_M, DEPTH_SHARE * self.depth) + 3 * view.noise
         clear = self.static & np.isfinite(view.depth) & ~view.raised
         if clear.sum() < MIN_PIXELS:
-            return Likeness(float("nan"), float("nan"), float("nan"), float("nan"))
+            return UNKNOWN_LIKENESS
         old, new = self.depth[clear], view.depth[clear]
         return Likeness(
             float((np.abs(new - old) < tolerance[clear]).mean()),

@@ -17,6 +17,7 @@ from robust_instant_policy.pointcloud import in_metres, steady, table_plane
 MAX_EDGE_PX = 160  # the longer edge of the grid
 RAISED_M = 0.012  # height above the table from which a point belongs to an object,
 RAISED_DEVIATIONS = 5.0  # or this many deviations of the depth's noise, if that is more
+MIN_ON_PLANE = 0.4  # share of the readings on the table's plane from which its height and tilt mean something
 MUCH_BELOW = 0.3  # share of the readings below a plane that make it no table
 MIN_POINTS = 100  # readings below which an image says nothing
 PLANE_SEED = 0
@@ -72,9 +73,9 @@ class View:
         return cls(observation, every, grid, rgb, points, plane, height, noise, share, raised)
 
     @property
-    def num_readings(self) -> int:
-        """Pixels of the grid with a steady depth."""
-        return int(np.isfinite(self.depth).sum())
+    def shows_table(self) -> bool:
+        """Whether enough of the image is the table to measure its height and tilt."""
+        return self.share_on_plane >= MIN_ON_PLANE
 
     @property
     def is_support(self) -> bool:
@@ -90,7 +91,7 @@ class View:
     @property
     def camera_height(self) -> float:
         """Of the camera above the table plane, metres; negative where it looks from below."""
-        return float(self.observation.camera_pose[:3, 3] @ self.plane[:3] + self.plane[3])
+        return float(self.above_plane(self.observation.camera_pose[:3, 3]))
 
     @cached_property
     def tree(self) -> cKDTree:
