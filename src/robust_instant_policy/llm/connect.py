@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 from urllib.parse import urlsplit
 
 from robust_instant_policy.errors import UsageError
@@ -68,7 +69,7 @@ def _parse(spec: str) -> tuple[str, Callable[[], LanguageModel]]:
 
 
 def _endpoint(url: str, model: str, style: str) -> LanguageModel:
-    from robust_instant_policy.llm.dialect import STYLES
+    from robust_instant_policy.llm.dialect import Style
     from robust_instant_policy.llm.endpoint import Endpoint
 
-    return Endpoint(url, model, next((known for known in STYLES if known == style), None))
+    return Endpoint(url, model, cast(Style | None, style or None))

@@ -20,7 +20,6 @@ OPTIONAL_FIELDS = ("seed", "stop", "temperature")  # left out when a server does
 _CONSTRAINTS = {"llamacpp": "grammar", "vllm": "structured_outputs", "sglang": "regex"}
 
 Style = Literal["chat", "completions"]
-STYLES: tuple[Style, ...] = ("chat", "completions")
 
 
 @dataclass(frozen=True)

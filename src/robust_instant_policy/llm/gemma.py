@@ -8,11 +8,11 @@ import os
 import re
 import stat
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from robust_instant_policy.errors import MissingExtraError, ModelError
 from robust_instant_policy.files import NO_SPACE
-from robust_instant_policy.llm.gguf import cut_vocabulary
 from robust_instant_policy.llm.llama import LlamaModel
 
 EMBEDDED_NAME = "gemma-3-270m-q4_k_m-numbers"
@@ -30,6 +30,9 @@ LICENCE_NOTICE = (
 # Prompts consist of digits and letters one by one, spaces, line breaks, and the marks around numbers.
 _KEPT = re.compile(r"[A-Za-z0-9]|[▁ \n]+|▁?[+\-.,:;=>|\[\]()/]{1,2}")
 _NORMAL, _USER_DEFINED, _BYTE = 1, 4, 6  # llama.cpp's token types
+_TOKENS, _TYPES = "tokenizer.ggml.tokens", "tokenizer.ggml.token_type"
+_PER_TOKEN = (_TOKENS, "tokenizer.ggml.scores", _TYPES)
+_EMBEDDING = "token_embd.weight"
 
 
 def cache_folder() -> Path:
@@ -91,6 +94,51 @@ def _make(path: Path) -> None:
         raise ModelError(f"the installed gguf writes the embedded model differently; run: pip install {WRITER}")
     if is_first:
         print(LICENCE_NOTICE, file=sys.stderr)
+
+
+def cut_vocabulary(source: Path, target: Path, keep: Callable[[str, int], bool]) -> None:
+    """Write a copy of ``source`` to ``target`` with only the tokens for which ``keep(piece, type)`` is true.
+
+    Special tokens that the header names are always kept. ``target`` takes its name when it is whole. For models
+    with scored pieces and one embedding row each, without output weights of their own (SentencePiece: Gemma, Llama 2).
+
+    Of Gemma 3 270M's 268 million parameters 168 million are the embeddings of 262,144 tokens, and every sampled token
+    scores all of them; text made of numbers uses a few hundred. Rows that are kept are kept bit for bit, so the scores
+    of the kept tokens are those of the whole model.
+    """
+    try:
+        from gguf import GGUFReader, GGUFValueType, GGUFWriter
+    except ModuleNotFoundError:
+        raise MissingExtraError("gguf", "embedded") from None
+    reader = GGUFReader(source)
+    fields = {name: field for name, field in reader.fields.items() if not name.startswith("GGUF.")}
+    special = {name: field.contents() for name, field in fields.items() if name.endswith("_token_id")}
+    vocabulary = enumerate(zip(fields[_TOKENS].contents(), fields[_TYPES].contents(), strict=True))
+    kept = [index for index, (piece, kind) in vocabulary if index in special.values() or keep(piece, kind)]
+    part = target.with_name(f"{target.name}.{os.getpid()}.part")
+    writer = GGUFWriter(part, fields["general.architecture"].contents())
+    for name, field in fields.items():
+        value = field.contents()
+        if name in _PER_TOKEN:
+            value = [value[index] for index in kept]
+        elif name in special:
+            value = kept.index(value)
+        if name != "general.architecture":  # the writer has written it
+            is_array = field.types[0] == GGUFValueType.ARRAY
+            writer.add_key_value(name, value, field.types[0], field.types[-1] if is_array else None)
+    for tensor in reader.tensors:
+        data = tensor.data[kept] if tensor.name == _EMBEDDING else tensor.data
+        writer.add_tensor(tensor.name, data, raw_dtype=tensor.tensor_type)
+    try:
+        writer.write_header_to_file()
+        writer.write_kv_data_to_file()
+        writer.write_tensors_to_file()
+        writer.close()
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _damaged(reason: str) -> ModelError:

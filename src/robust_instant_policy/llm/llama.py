@@ -15,6 +15,7 @@ import signal
 import threading
 import time
 import urllib.request
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -29,6 +30,7 @@ from robust_instant_policy.query import Answer, Query
 
 SHORT_TOKENS = 2048  # prompts up to this length, with their answers, run many at a time
 SLOT_STEP_TOKENS, LONG_STEP_TOKENS = 256, 4096  # short and long slots come in multiples of these
+COUNTED_PROMPTS = 3  # the longest, whose tokens are counted
 SHORT_SLOTS = 24  # over all cores; a plan has about ten prompts an arm
 MAX_SERVERS = 8  # more cores bring little to ten or twenty prompts
 PROGRESS_TOKENS = 128  # read between two checks of the deadline and of Ctrl-C, by each prompt
@@ -166,12 +168,10 @@ class LlamaModel:
             slot.queue = []
         rounds = -(-len(queries) // len(self._slots))
         pairs = sorted(
-            (
-                (-_common_length(query.text, slot.text), place, index)
-                for index, query in enumerate(queries)
-                for place, slot in enumerate(self._slots)
-                if slot.text
-            ),
+            (-_common_length(query.text, slot.text), place, index)
+            for index, query in enumerate(queries)
+            for place, slot in enumerate(self._slots)
+            if slot.text
         )
         placed: set[int] = set()
         for shared, place, index in pairs:
@@ -182,12 +182,11 @@ class LlamaModel:
         for index in range(len(queries)):
             if index not in placed:
                 # The server with the least work first, so that all cores are busy to the end.
-                load = {id(server): 0 for server in self._servers}
+                load: Counter[int] = Counter()
                 for slot in self._slots:
                     load[id(slot.server)] += len(slot.queue)
-                min(
-                    self._slots, key=lambda slot: (len(slot.queue), bool(slot.text), load[id(slot.server)])
-                ).queue.append(index)
+                free = min(self._slots, key=lambda slot: (len(slot.queue), bool(slot.text), load[id(slot.server)]))
+                free.queue.append(index)
 
     def _layout_for(self, queries: Sequence[Query]) -> _Layout:
         # A token is at least one character of the numbers' alphabet, so most prompts need not be counted.
@@ -195,7 +194,8 @@ class LlamaModel:
         longest = max(queries, key=lambda query: len(query.text) + query.max_tokens)
         need = len(longest.text) + 1 + longest.max_tokens
         if need > SLOT_STEP_TOKENS:
-            need = max(self.count_tokens(query.text) + query.max_tokens for query in _longest(queries))
+            by_length = sorted(queries, key=lambda query: len(query.text) + query.max_tokens)
+            need = max(self.count_tokens(query.text) + query.max_tokens for query in by_length[-COUNTED_PROMPTS:])
         if need > self.context_length:
             raise context_error(need - longest.max_tokens, longest.max_tokens, self.context_length)
         layout = _short_layout(need) if need <= SHORT_TOKENS else _long_layout(need, self.context_length)
@@ -322,10 +322,6 @@ def _long_layout(tokens: int, most: int) -> _Layout:
 
 def _rounded(tokens: int, step: int) -> int:
     return -(-tokens // step) * step
-
-
-def _longest(queries: Sequence[Query], count: int = 3) -> list[Query]:
-    return sorted(queries, key=lambda query: len(query.text) + query.max_tokens)[-count:]
 
 
 def _common_length(a: str, b: str) -> int:

@@ -124,51 +124,36 @@ class SampleStore:
         key = (model, digest, settings, sample)
         where = "WHERE model = ? AND query = ? AND settings = ? AND sample = ?"
         asked = (query.text, query.instruction, query.grammar, query.pattern, json.dumps(query.stop), query.max_tokens)
-        with self._lock:
+        with self._lock, self._db:  # commits, or takes back
             self._db.execute("BEGIN IMMEDIATE")
-            try:
-                self._db.execute("INSERT OR IGNORE INTO queries VALUES (?, ?, ?, ?, ?, ?, ?)", (digest, *asked))
-                taken = self._db.execute(
-                    f"SELECT text FROM answers {where} AND attempt = ?", (*key, attempt)
-                ).fetchone()
-                if taken is not None and taken != (text,):
-                    last = f"SELECT MAX(attempt) + 1 FROM answers {where} AND text IS NOT NULL"
-                    attempt = self._db.execute(last, key).fetchone()[0]
-                self._db.execute(
-                    "INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", (*key, attempt, text, *cost)
-                )
-            except BaseException:
-                self._db.execute("ROLLBACK")
-                raise
-            self._db.execute("COMMIT")
+            self._db.execute("INSERT OR IGNORE INTO queries VALUES (?, ?, ?, ?, ?, ?, ?)", (digest, *asked))
+            taken = self._db.execute(f"SELECT text FROM answers {where} AND attempt = ?", (*key, attempt)).fetchone()
+            if taken is not None and taken != (text,):
+                last = f"SELECT MAX(attempt) + 1 FROM answers {where} AND text IS NOT NULL"
+                attempt = self._db.execute(last, key).fetchone()[0]
+            self._db.execute(
+                "INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", (*key, attempt, text, *cost)
+            )
 
-    def take(self, other: str | Path) -> int:
-        """Copy what only the store at ``other`` holds, all of it or nothing; returns the number of answers copied.
+    def take(self, other: str | Path) -> None:
+        """Copy what only the store at ``other`` holds, all of it or nothing.
 
         Raises `UsageError` where ``other`` is not a store.
         """
         if not Path(other).is_file():
             raise UsageError(f"no sample store at {other}")
         with self._lock:
-            before = self._count()
             try:
                 self._db.execute("ATTACH ? AS other", (str(other),))
                 try:
-                    self._db.execute("BEGIN IMMEDIATE")
-                    for table in ("queries", "answers", "failures"):
-                        self._db.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM other.{table}")
-                    self._db.execute("COMMIT")
+                    with self._db:
+                        self._db.execute("BEGIN IMMEDIATE")
+                        for table in ("queries", "answers", "failures"):
+                            self._db.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM other.{table}")
                 finally:
-                    if self._db.in_transaction:
-                        self._db.execute("ROLLBACK")
                     self._db.execute("DETACH other")
             except sqlite3.DatabaseError as error:
                 raise UsageError(f"the samples of {other} cannot be copied to {self.path} ({error})") from None
-            return self._count() - before
-
-    def _count(self) -> int:
-        count: int = self._db.execute("SELECT COUNT(text) FROM answers").fetchone()[0]
-        return count
 
     def read(self, model: str, query: Query, settings: str, sample: int) -> list[Answer | None]:
         """All attempts at one sample, in order, and None last when no acceptable one came. Empty: never asked."""
