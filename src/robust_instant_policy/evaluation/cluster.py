@@ -69,8 +69,8 @@ class _Actors:
 
         self._setup, self._most = setup, most
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
-        keeper = ray.remote(num_cpus=0, scheduling_strategy=here)(_Keeper)
-        self._keeper = keeper.remote(setup.store.absolute())
+        store = ray.remote(num_cpus=0, scheduling_strategy=here)(SampleStore)
+        self._store = store.remote(setup.store.absolute())
         self._shown = {task: ray.put(shown) for task, shown in demonstrations.items()}
         self._kind = ray.remote(
             num_cpus=CORES_A_WORKER, max_restarts=0, runtime_env={"env_vars": dict(ONE_THREAD)}
@@ -84,7 +84,7 @@ class _Actors:
             wanted = min(wanted, self._most)
         room = int(ray.available_resources().get("CPU", 0) // CORES_A_WORKER)
         for _ in range(min(room, wanted - len(self._members))):
-            self._members.append(_Member(actor=self._kind.remote(self._setup, self._keeper, self._shown)))
+            self._members.append(_Member(actor=self._kind.remote(self._setup, self._store, self._shown)))
         return self._members
 
     def give(self, worker: _Member, work: SceneWork) -> None:
@@ -118,9 +118,9 @@ class _Actors:
 class _Actor:
     """A worker: a workbench that lives in a Ray actor."""
 
-    def __init__(self, setup: Setup, keeper: Any, shown: dict[str, Any]):
+    def __init__(self, setup: Setup, store: Any, shown: dict[str, Any]):
         self._shown = shown
-        self._bench = Workbench(setup, cast(SampleStore, _DistantStore(keeper, setup.store)), self._demonstrations)
+        self._bench = Workbench(setup, cast(SampleStore, _DistantStore(store, setup.store)), self._demonstrations)
 
     def run(self, work: SceneWork) -> Iterator[Outcome | WorkError]:
         """Each outcome of ``work`` as it comes, and the error that ended it early, if one did."""
@@ -135,26 +135,16 @@ class _Actor:
         return ray.get(self._shown[task])[:count]
 
 
-class _Keeper:
-    """The sample store of the run, in an actor of its own."""
-
-    def __init__(self, path: Path):
-        self._store = SampleStore(path)
-
-    def call(self, name: str, arguments: tuple) -> Any:
-        return getattr(self._store, name)(*arguments)
-
-
 class _DistantStore:
-    """A `SampleStore` on another machine: whatever is asked of it is asked there."""
+    """A `SampleStore` that is a Ray actor, perhaps on another machine: whatever is asked of it is asked there."""
 
-    def __init__(self, keeper: Any, path: Path):
-        self._keeper, self.path = keeper, path
+    def __init__(self, actor: Any, path: Path):
+        self._actor, self.path = actor, path
 
     def __getattr__(self, name: str) -> Any:
         import ray
 
-        return lambda *arguments: ray.get(self._keeper.call.remote(name, arguments))
+        return lambda *arguments: ray.get(getattr(self._actor, name).remote(*arguments))
 
 
 def _most_demonstrations(setup: Setup, works: list[SceneWork]) -> dict[str, list[Demonstration]]:
