@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from robust_instant_policy.evaluation import (
     Episode,
     Progress,
     Setup,
-    Suite,
     Variant,
     make_suites,
     run_suites,
@@ -94,15 +92,25 @@ def run(options: argparse.Namespace) -> int:
         LocalWorkers(options.workers or 1) if options.ray is None else RayWorkers(options.ray, options.workers)
     )
     suites = make_suites(options.suite or ["chosen"], choice)
-    evaluate(suites, setup, options.out, workers, ["rip", *options.arguments], options.keep)
+    screen = StageConsole()
+    with screen.stage("evaluation"):
+        run_suites(
+            suites,
+            setup,
+            options.out,
+            workers,
+            _progress(screen, options.out),
+            ["rip", *options.arguments],
+            options.keep,
+        )
+    screen.say("")
+    screen.say(publish(options.out))
+    screen.say(f"rows: {options.out / EPISODES_FILE}; all of it: {options.out / PAGE_FILE}")
     return 0
 
 
-def evaluate(
-    suites: Sequence[Suite], setup: Setup, out: Path, workers: Workers, arguments: Sequence[str], keep: bool
-) -> None:
-    """Run what is missing of ``suites`` in ``out``, on the screen; then tables, figures and page. See `run_suites`."""
-    screen = StageConsole()
+def _progress(screen: StageConsole, out: Path) -> Progress:
+    """Rows and bars on the ``screen``, and a picture of each training in ``out``."""
 
     def recording(task: str, there: int, count: int, thrown_away: int) -> None:
         screen.done_so_far(f"{task}: recording ({thrown_away} thrown away)", there, count)
@@ -118,11 +126,6 @@ def evaluate(
             screen.say(f"  {what.scene} {what.variant} #{what.candidate}: {verdict}")
         screen.done_so_far("plans executed", done, total)
 
-    progress = Progress(
+    return Progress(
         recording, outcome, TrainingScreen(screen), trained=partial(keep_training_picture, out), note=screen.say
     )
-    with screen.stage("evaluation"):
-        run_suites(suites, setup, out, workers, progress, arguments, keep)
-    screen.say("")
-    screen.say(publish(out))
-    screen.say(f"rows: {out / EPISODES_FILE}; all of it: {out / PAGE_FILE}")

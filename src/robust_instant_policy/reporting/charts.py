@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import plotly.graph_objects as go
 from markupsafe import Markup
 from plotly.subplots import make_subplots
 
-from robust_instant_policy.geometry import GripperTriangle
+from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.policies.policy import Plan
 from robust_instant_policy.reporting.pictures import keypoint_colour, tool_points
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
@@ -48,11 +50,9 @@ def paths_in_space(plan: Plan) -> go.Figure:
         weight = np.interp(candidate.times, plan.trajectory.times, plan.weights[index])
         shade = {"color": weight, "colorscale": WEIGHT_COLOURS, "cmin": 0, "cmax": 1}
         for arm in range(candidate.num_arms):
-            x, y, z = (tool_points(candidate, arm) * MM).T
-            figure.add_scatter3d(
-                x=x,
-                y=y,
-                z=z,
+            _add_points(
+                figure,
+                tool_points(candidate, arm),
                 mode="lines+markers",
                 name=candidate_name(plan, index),
                 showlegend=False,
@@ -69,15 +69,14 @@ def paths_in_space(plan: Plan) -> go.Figure:
             )
     for arm in range(plan.trajectory.num_arms):
         _add_robust_path(figure, plan, arm)
-    x, y, z = (plan.keypoints.reshape(-1, 3) * MM).T
-    figure.add_scatter3d(
-        x=x,
-        y=y,
-        z=z,
+    keypoints = plan.keypoints.reshape(-1, 3)
+    _add_points(
+        figure,
+        keypoints,
         mode="markers+text",
         name="keypoints",
-        text=[str(k) for k in range(len(x))],
-        marker={"size": 5, "color": [keypoint_colour(k) for k in range(len(x))]},
+        text=[str(k) for k in range(len(keypoints))],
+        marker={"size": 5, "color": [keypoint_colour(k) for k in range(len(keypoints))]},
     )
     axes = {f"{axis}axis_title": f"world {axis} [mm]" for axis in "xyz"}
     figure.update_layout(
@@ -89,12 +88,16 @@ def paths_in_space(plan: Plan) -> go.Figure:
     return figure
 
 
+def _add_points(figure: go.Figure, points: FloatArray, **look: Any) -> None:
+    """``points (N, 3)`` in metres, drawn in millimetres."""
+    x, y, z = (points * MM).T
+    figure.add_scatter3d(x=x, y=y, z=z, **look)
+
+
 def _add_robust_path(figure: go.Figure, plan: Plan, arm: int) -> None:
-    x, y, z = (tool_points(plan.trajectory, arm) * MM).T
-    figure.add_scatter3d(
-        x=x,
-        y=y,
-        z=z,
+    _add_points(
+        figure,
+        tool_points(plan.trajectory, arm),
         mode="lines+markers",
         name="robust trajectory",
         legendgroup="robust",
@@ -107,11 +110,9 @@ def _add_robust_path(figure: go.Figure, plan: Plan, arm: int) -> None:
     for step in np.unique(np.linspace(0, len(poses) - 1, AXIS_STEPS).astype(int)):
         origin, rotation = poses[step, :3, 3], poses[step, :3, :3]
         for axis, (colour, name) in enumerate(AXES):
-            x, y, z = (np.stack([origin, origin + AXIS_LENGTH_M * rotation[:, axis]]) * MM).T
-            figure.add_scatter3d(
-                x=x,
-                y=y,
-                z=z,
+            _add_points(
+                figure,
+                np.stack([origin, origin + AXIS_LENGTH_M * rotation[:, axis]]),
                 mode="lines",
                 line={"color": colour, "width": 5},
                 name=name,
