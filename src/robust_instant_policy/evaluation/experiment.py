@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robust_instant_policy.demonstration import Demonstration
-from robust_instant_policy.evaluation.episodes import Episode, Trial
+from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey, Trial
 from robust_instant_policy.evaluation.failures import Failure, video_file
 from robust_instant_policy.evaluation.manifest import code_digest
 from robust_instant_policy.evaluation.scenes import (
@@ -38,7 +40,7 @@ PLAN_FOLDER, TRAINING_FOLDER = "plans", "training"
 
 
 def ignore(*_: object) -> None:
-    """The callback of a caller who does not look."""
+    """The default callback."""
 
 
 @dataclass(frozen=True)
@@ -126,18 +128,9 @@ def one_writer(out: Path) -> Iterator[None]:
 
 def identified(suite: Suite, setup: Setup) -> Suite:
     """``suite`` with all that decides its rows but the demonstrations: network, code, deadline."""
-    return replace(
-        suite,
-        variants=tuple(
-            replace(
-                variant,
-                features=resolve_features(variant.features),
-                code=code_digest(),
-                deadline_s=setup.deadline_s,
-            )
-            for variant in suite.variants
-        ),
-    )
+    decided = partial(replace, code=code_digest(), deadline_s=setup.deadline_s)
+    variants = (decided(variant, features=resolve_features(variant.features)) for variant in suite.variants)
+    return replace(suite, variants=tuple(variants))
 
 
 def wanted_trials(suites: Iterable[Suite]) -> list[Trial]:
@@ -177,28 +170,28 @@ def missing_work(
 ) -> list[SceneWork]:
     """What is still to be done for the ``wanted`` plans, of which those ``kept`` go into files, scene by scene."""
     left = executions_left(rows)
-    among = set(wanted)
     examined = {row.key for row in failures}
-    variants: dict[Scene, list[Variant]] = {scene: [] for scene, _ in wanted}
+    todo: defaultdict[Scene, list[Variant]] = defaultdict(list)
+    plans: defaultdict[Scene, list[Variant]] = defaultdict(list)
+    done: defaultdict[Scene, set[EpisodeKey]] = defaultdict(set)
+    failed: defaultdict[Scene, list[Episode]] = defaultdict(list)
     for scene, variant in wanted:
         if left.get((scene, variant)) != 0:
-            variants[scene].append(variant)
-    done: dict[Scene, set] = {scene: set() for scene in variants}
-    failed: dict[Scene, list[Episode]] = {scene: [] for scene in variants}
+            todo[scene].append(variant)
+    among = set(wanted)
     for row in rows:
         if row.trial in among:
             done[row.scene].add(row.key)
             filmed = not films or row.executed_seconds == 0 or (out / video_file(*row.key)).exists()
             if not row.success and not (row.key in examined and filmed):
                 failed[row.scene].append(row)
-    plans: dict[Scene, list[Variant]] = {scene: [] for scene in variants}
     for scene, variant in kept:
         if not (out / plan_file(scene, variant)).exists():
             plans[scene].append(variant)
     return [
-        SceneWork(scene, tuple(todo), frozenset(done[scene]), tuple(failed[scene]), tuple(plans[scene]))
-        for scene, todo in variants.items()
-        if todo or failed[scene] or plans[scene]
+        SceneWork(scene, tuple(todo[scene]), frozenset(done[scene]), tuple(failed[scene]), tuple(plans[scene]))
+        for scene in dict.fromkeys(scene for scene, _ in wanted)
+        if todo[scene] or failed[scene] or plans[scene]
     ]
 
 
@@ -213,7 +206,7 @@ def _of_any_demonstrations(trial: Trial) -> Trial:
 
 
 def _superseded(trials: Sequence[Trial], rows: Sequence[Episode]) -> int:
-    """How many of ``trials`` have no executions of their own, but some that differ only in what nobody chose."""
+    """How many of ``trials`` lack executions, but have some that differ only in settings that no user chose."""
 
     def chosen(trial: Trial) -> Trial:
         scene, variant = trial

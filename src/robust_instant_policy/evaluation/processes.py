@@ -113,16 +113,15 @@ def one_thread_each() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """Have this process end at once when the one that started it is no more, whatever this one is doing.
+    """Have this process end at once when its parent ends, and not minutes later, with its next row.
 
-    It would find out only with its next row, and plan on for minutes until then. On Linux the kernel sees to it, also
-    where a library holds the interpreter's lock; elsewhere a thread does.
+    On Linux the kernel does it, also while a library holds the interpreter's lock; elsewhere a thread does.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent.pid:  # it was killed before the kernel was told
+        if os.getppid() != parent.pid:  # it ended before the request
             os._exit(1)
         return
 
@@ -134,8 +133,8 @@ def end_with_parent() -> None:
 
 
 def _serve(pipe: Connection, setup: Setup) -> None:
-    """The life of a worker: a scene comes in, its outcomes go out one by one, until nobody listens any more."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who keeps the rows
+    """Do the scenes that come through ``pipe`` and send their outcomes one by one, until it is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent, which keeps the rows, handles Ctrl-C
     end_with_parent()
     bench = Workbench(setup)
     try:

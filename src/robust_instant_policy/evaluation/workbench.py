@@ -71,7 +71,7 @@ class Workbench:
         self._forget()
 
     def run(self, work: SceneWork) -> Iterator[Outcome]:
-        """Everything that is to be done in one scene: first all executions, then failed episodes are taken apart."""
+        """Everything that is to be done in one scene: first all executions, then the analysis of failed ones."""
         task = self._enter(work.scene)
         self._show(work)
         observation = task.reset(work.scene.seed)
@@ -90,7 +90,7 @@ class Workbench:
             if isinstance(policy, RememberingPolicy):
                 with suppress(KeypointError, PlanningError):
                     yield Planned(work.scene, variant, policy.plan(observation))
-        yield from self._take_apart(task, work.scene, failed, observation)
+        yield from self._analyse(task, work.scene, failed, observation)
 
     def train(self, work: SceneWork, variant: Variant) -> TrainedPolicy:
         """Make and train the policy of ``variant`` for the scenes of ``work``, as `run` would."""
@@ -186,7 +186,7 @@ class Workbench:
                 )
         return self._policies[variant]
 
-    def _take_apart(
+    def _analyse(
         self, task: Task, scene: Scene, failed: Sequence[Episode], observation: Observation
     ) -> Iterator[Analysis]:
         analysis = FailureAnalysis(task, scene)

@@ -28,7 +28,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Died:
-    """A worker is no more, because of ``cause``."""
+    """A worker has ended because of ``cause``."""
 
     cause: str
 
@@ -61,10 +61,7 @@ Message = Outcome | Finished | WorkError | Died
 
 @dataclass(eq=False)
 class Worker:
-    """A worker as the pool sees it: the scene it was given (None: it is free) and what it has said of it.
-
-    ``task`` is the one that its simulator runs.
-    """
+    """A worker as the pool sees it: its scene (None: it is free), its simulator's task, and the scene's outcomes."""
 
     work: SceneWork | None = None
     task: str = ""
@@ -86,7 +83,7 @@ class Pool(Protocol[W]):
         ...
 
     def receive(self, busy: Collection[W]) -> Iterator[tuple[W, Message]]:
-        """What any of ``busy`` say next; nothing after a while without a word."""
+        """The next messages of any of ``busy``; none after a while of silence."""
         ...
 
     def close(self) -> None:

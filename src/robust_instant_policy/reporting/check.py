@@ -20,7 +20,7 @@ from robust_instant_policy.reporting.pictures import (
 )
 from robust_instant_policy.reporting.tables import NONE, Table
 from robust_instant_policy.sanity import Finding, SetReport, errors
-from robust_instant_policy.sanity.contact import Path
+from robust_instant_policy.sanity.contact import GripperPath
 from robust_instant_policy.sanity.view import View
 
 RAISED_TINT = np.array([0.0, 200.0, 255.0])  # of what stands above the table
@@ -105,7 +105,7 @@ def _picture(observation: Observation, caption: str, demonstration: Demonstratio
         for arm in range(demonstration.trajectory.num_arms):
             points = svg_points(tool_points(demonstration.trajectory, arm), observation)
             lines.append(Line(points, PATH_COLOUR, 1.2 * scale, title="middle of the fingertips"))
-        marks = _grasps(Path.of(demonstration.trajectory).closings, observation)
+        marks = _grasps(GripperPath.of(demonstration.trajectory).closings, observation)
     return picture(rgb.astype(np.uint8), caption, lines, marks)
 
 

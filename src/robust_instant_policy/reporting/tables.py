@@ -120,7 +120,13 @@ def sweep_table(summary: Summary, name: str, value: Callable[[Variant], str]) ->
     ]
     rows.append(("average", *(_spread(summary, variant) for variant in summary.variants)))
     counts = dict.fromkeys(_executions(summary, variant) for variant in summary.variants)
-    return Table(head, tuple(rows), f"{_reading(summary)} Executions a task: {', '.join(counts)}.")
+    return Table(
+        head,
+        tuple(rows),
+        f"Success of {summary.variants[0].method} in percent, {summary.variants[0].demos} demonstrations shown; in "
+        "parentheses Wilson's 95% interval; the best of a task is bold. Averages: mean ± standard deviation over "
+        f"tasks. Executions a task: {', '.join(counts)}.",
+    )
 
 
 def demos_table(summary: Summary) -> Table:
@@ -219,13 +225,6 @@ def _paper_average(variant: Variant, tasks: Sequence[str]) -> str:
 def _executions(summary: Summary, variant: Variant) -> str:
     counts = [rate.trials for task in summary.tasks if (rate := summary.rate(variant, task)) is not None]
     return str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
-
-
-def _reading(summary: Summary) -> str:
-    return (
-        f"Success of {summary.variants[0].method} in percent, {summary.variants[0].demos} demonstrations shown; in "
-        "parentheses Wilson's 95% interval; the best of a task is bold. Averages: mean ± standard deviation over tasks."
-    )
 
 
 def _p(value: float) -> str:

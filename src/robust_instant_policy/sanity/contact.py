@@ -33,7 +33,7 @@ class Contact:
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class GripperPath:
     """The steps of a trajectory that are compared with images.
 
     ``fingers (M, 3)`` points between the fingertips, ``palms (P, 3)``, ``tips (2P, 3)`` and ``closings (G, 3)``, the
@@ -46,7 +46,7 @@ class Path:
     closings: FloatArray
 
     @classmethod
-    def of(cls, trajectory: Trajectory) -> Path:
+    def of(cls, trajectory: Trajectory) -> GripperPath:
         """Thin ``trajectory`` out; idle arms, which never move, touch nothing."""
         closed = trajectory.gripper_state > 0.5
         closing = np.argwhere(closed[1:] & ~closed[:-1]) + np.array([1, 0])
@@ -70,7 +70,7 @@ def gaps(view: View, points: FloatArray) -> FloatArray:
     return np.where(inside, 0.0, distance)
 
 
-def contact(view: View, path: Path) -> Contact:
+def contact(view: View, path: GripperPath) -> Contact:
     """How ``path`` lies to the scene of ``view``."""
     behind, raised = view.behind_surface(path.palms)
     buried = behind[raised & np.isfinite(behind)]

@@ -10,12 +10,8 @@ from scipy.optimize import linear_sum_assignment
 
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.sanity.consistency import (
-    MIN_DEMONSTRATIONS,
-    Consistency,
-    repetition,
-)
-from robust_instant_policy.sanity.contact import Contact, Path, contact
+from robust_instant_policy.sanity.consistency import MIN_DEMONSTRATIONS, Consistency, repetition
+from robust_instant_policy.sanity.contact import Contact, GripperPath, contact
 from robust_instant_policy.sanity.hypotheses import ALL, DISPLACED, Hypothesis
 from robust_instant_policy.sanity.view import View, coarse
 
@@ -94,8 +90,8 @@ def fits(contact: Contact, view: View) -> bool:
     return above and contact.buried < BURIED_M
 
 
-def evidence(views: Sequence[View], paths: Sequence[Path], poses: Sequence[FloatArray]) -> Evidence:
-    """Of ``views``, and the `Path` and tool poses that belong to each."""
+def evidence(views: Sequence[View], paths: Sequence[GripperPath], poses: Sequence[FloatArray]) -> Evidence:
+    """Of ``views``, and the `GripperPath` and tool poses that belong to each."""
     contacts = tuple(contact(view, path) for view, path in zip(views, paths, strict=True))
     reach = [touch_distance(view) for view in views]
     closings = np.concatenate([c.grasps < near for c, near in zip(contacts, reach, strict=True)])
@@ -123,7 +119,7 @@ class Explanation:
 
 
 def explain(
-    demonstrations: Sequence[Demonstration], paths: Sequence[Path], poses: Sequence[FloatArray]
+    demonstrations: Sequence[Demonstration], paths: Sequence[GripperPath], poses: Sequence[FloatArray]
 ) -> Explanation | None:
     """The hypothesis under which images and paths fit best, if clearly better than as they are."""
     chosen = np.unique(np.round(np.linspace(0, len(demonstrations) - 1, TESTED)).astype(np.intp))
@@ -134,12 +130,12 @@ def explain(
         views = [View.of(hypothesis.correct(o) if hypothesis else o, repaired=True) for o in some]
         return evidence(views, own_paths, own_poses)
 
-    today = under(None)
+    as_is = under(None)
     found = [Explanation(h.cause, h.remedy, under(h)) for h in ALL]
     found += _other_pairing(demonstrations[:PAIRED], paths[:PAIRED], poses[:PAIRED])
-    found = [e for e in found if e.evidence.level > today.level - LESS_LEVEL]
-    best = max(found, key=lambda e: e.evidence.total, default=Explanation("", "", today))
-    if best.evidence.total <= today.total + BETTER:  # no known mistake: is the camera beside where it should be?
+    found = [e for e in found if e.evidence.level > as_is.level - LESS_LEVEL]
+    best = max(found, key=lambda e: e.evidence.total, default=Explanation("", "", as_is))
+    if best.evidence.total <= as_is.total + BETTER:  # no known mistake: is the camera beside where it should be?
         best = max(
             (Explanation(h.cause, h.remedy, under(h), displaced=True) for h in DISPLACED),
             key=lambda e: e.evidence.total,
@@ -147,11 +143,11 @@ def explain(
     clear = best.evidence.touching >= MOSTLY or best.evidence.grasping >= MOSTLY
     score = best.evidence.surroundings.score
     clear = clear and (not np.isfinite(score) or score >= EXPLAINED)
-    return best if clear and best.evidence.total > today.total + BETTER else None
+    return best if clear and best.evidence.total > as_is.total + BETTER else None
 
 
 def _other_pairing(
-    demonstrations: Sequence[Demonstration], paths: Sequence[Path], poses: Sequence[FloatArray]
+    demonstrations: Sequence[Demonstration], paths: Sequence[GripperPath], poses: Sequence[FloatArray]
 ) -> list[Explanation]:
     """The assignment of images to paths with the smallest gaps, where it is not the given one."""
     if len(demonstrations) < MIN_DEMONSTRATIONS:

@@ -10,7 +10,7 @@ from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.agreement import CLEARLY, Agreement, exchanged
 from robust_instant_policy.sanity.consistency import MIN_DEMONSTRATIONS
-from robust_instant_policy.sanity.contact import Path, gaps
+from robust_instant_policy.sanity.contact import GripperPath, gaps
 from robust_instant_policy.sanity.envelope import approaches
 from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.geometry import (
@@ -58,50 +58,50 @@ def check_each_image(views: Sequence[View]) -> list[Finding]:
 def check_contact(
     demonstrations: Sequence[Demonstration],
     views: Sequence[View],
-    paths: Sequence[Path],
+    paths: Sequence[GripperPath],
     poses: Sequence[FloatArray],
-    today: Evidence,
+    as_is: Evidence,
 ) -> list[Finding]:
     """Whether the paths meet what their images show; if not, why."""
-    count, score = len(views), today.surroundings.score
-    touches = today.touching >= MIN_SHARE or today.grasping >= MIN_SHARE
+    count, score = len(views), as_is.surroundings.score
+    touches = as_is.touching >= MIN_SHARE or as_is.grasping >= MIN_SHARE
     repeats = not np.isfinite(score) or score >= CONSISTENT
     own, other = score, float("nan")
     if count > MIN_DEMONSTRATIONS and scene_spread(views) > ONE_SCENE_M:
         own, other = pairing_scores(views, poses)
     exchangeable = own < other + OWN_BETTER
-    is_clear, closes = today.clear >= MIN_SHARE, any(len(c.grasps) for c in today.contacts)
-    right = is_clear and touches and repeats and today.level > 0 and not exchangeable
-    if right and np.mean([c.path < CLOSE_M for c in today.contacts]) >= MIN_SHARE:
-        return _outliers(views, today)
+    is_clear, closes = as_is.clear >= MIN_SHARE, any(len(c.grasps) for c in as_is.contacts)
+    right = is_clear and touches and repeats and as_is.level > 0 and not exchangeable
+    if right and np.mean([c.path < CLOSE_M for c in as_is.contacts]) >= MIN_SHARE:
+        return _outliers(views, as_is)
     numbers = {
-        "path_gap": today.path_gap,
-        "grasp_gap": today.grasp_gap,
-        "lowest": today.lowest,
+        "path_gap": as_is.path_gap,
+        "grasp_gap": as_is.grasp_gap,
+        "lowest": as_is.lowest,
         "consistency": score,
         "other_images": other,
-        "touching": today.touching,
-        "clear": today.clear,
+        "touching": as_is.touching,
+        "clear": as_is.clear,
     }
     explanation = None if right and count <= MIN_DEMONSTRATIONS else explain(demonstrations, paths, poses)
     if explanation and right and explanation.evidence.surroundings.score < score - LESS_CONSISTENT:
         explanation = None  # nearer by chance: what it shows around the gripper repeats less
     if explanation:
-        words = f"{_measured(today)}; {_explained(explanation)}"
+        words = f"{_measured(as_is)}; {_explained(explanation)}"
         # where the images do fit as they are, a hypothesis that fits better proves nothing
         severity: Severity = "warning" if right or (touches and is_clear and explanation.displaced) else "error"
         return [Finding("contact", severity, words, numbers, explanation.cause)]
     if right:
-        return _outliers(views, today)
+        return _outliers(views, as_is)
     if is_clear and not any(view.raised.any() for view in views):
         words = "nothing in the images stands above the table: whether images and paths belong together was not checked"
         return [Finding("contact", "warning" if closes else "unchecked", words, numbers, "flat depth: nothing raised")]
     if not is_clear:
         advice = "; check the camera's pose, the depth unit and the tool's offset"
-        return [Finding("contact", "error", _measured(today) + advice, numbers)]
+        return [Finding("contact", "error", _measured(as_is) + advice, numbers)]
     if not touches:
         advice = "; check the camera's pose, the tool's offset and which image belongs to which path"
-        words = _measured(today) + (advice if closes else "; nothing closes there, so it was not checked further")
+        words = _measured(as_is) + (advice if closes else "; nothing closes there, so it was not checked further")
         return [Finding("contact", "error" if closes else "warning", words, numbers)]
     if exchangeable:
         words = f"the paths fit their own images no better than each other's ({own:.2f} against {other:.2f} of 1)"
@@ -111,23 +111,23 @@ def check_contact(
     return [Finding("contact", "unchecked", f"{words}: whether the camera is right was not decided", numbers)]
 
 
-def _measured(today: Evidence) -> str:
+def _measured(as_is: Evidence) -> str:
     """What is wrong with the evidence, worst first."""
-    if today.lowest < -TOUCH_M:
-        return f"fingertips reach {-today.lowest * 1e3:.0f} mm below the table that the images show"
-    if today.clear < MIN_SHARE:
-        buried = float(np.median([c.buried for c in today.contacts]))
+    if as_is.lowest < -TOUCH_M:
+        return f"fingertips reach {-as_is.lowest * 1e3:.0f} mm below the table that the images show"
+    if as_is.clear < MIN_SHARE:
+        buried = float(np.median([c.buried for c in as_is.contacts]))
         return f"the palm passes {buried * 1e3:.0f} mm deep through what the images show"
-    if today.touching < MIN_SHARE:
-        if np.isfinite(today.grasp_gap) and today.grasp_gap > TOUCH_M:
-            grasps = f"grasp points lie {today.grasp_gap:.2f} m from any surface"
-            return f"{grasps}, and no path comes nearer than {today.path_gap:.2f} m"
-        return f"paths come no nearer than {today.path_gap:.2f} m to any surface"
-    score = today.surroundings.score
+    if as_is.touching < MIN_SHARE:
+        if np.isfinite(as_is.grasp_gap) and as_is.grasp_gap > TOUCH_M:
+            grasps = f"grasp points lie {as_is.grasp_gap:.2f} m from any surface"
+            return f"{grasps}, and no path comes nearer than {as_is.path_gap:.2f} m"
+        return f"paths come no nearer than {as_is.path_gap:.2f} m to any surface"
+    score = as_is.surroundings.score
     if np.isfinite(score) and score < CONSISTENT:
         return f"what the images show around the gripper does not repeat across the demonstrations ({score:.2f} of 1)"
-    if today.level > 0:
-        return f"paths come within {today.path_gap * 1e3:.0f} mm of what the images show"
+    if as_is.level > 0:
+        return f"paths come within {as_is.path_gap * 1e3:.0f} mm of what the images show"
     return "the camera lies below the table that it sees"
 
 
@@ -141,9 +141,9 @@ def _explained(explanation: Explanation) -> str:
     return f"{words}: {explanation.remedy}"
 
 
-def check_palms(today: Evidence) -> list[Finding]:
+def check_palms(as_is: Evidence) -> list[Finding]:
     """A palm that touches the table belongs to a tool frame whose axes or offset are wrong."""
-    lowest = float(np.median([c.lowest_palm for c in today.contacts]))
+    lowest = float(np.median([c.lowest_palm for c in as_is.contacts]))
     if lowest > LOWEST_PALM_M:
         return []
     words = f"the palm comes within {lowest * 1e3:.0f} mm of the table: the gripper lies on its side or upside down"
@@ -168,16 +168,16 @@ def check_openings(demonstrations: Sequence[Demonstration], views: Sequence[View
     return [Finding("gripper state", "warning", words + advice, {"inverted": float(inverted)}, "states inverted")]
 
 
-def _outliers(views: Sequence[View], today: Evidence) -> list[Finding]:
+def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
     """Single demonstrations whose path does not fit their image while the others' do."""
     if len(views) < MIN_DEMONSTRATIONS + 1:
         return []
-    likeness = today.surroundings.likeness
+    likeness = as_is.surroundings.likeness
     usual = float(np.median(likeness))
     found = []
-    for index, (c, view) in enumerate(zip(today.contacts, views, strict=True)):
+    for index, (c, view) in enumerate(zip(as_is.contacts, views, strict=True)):
         unlike = usual >= ALIKE and likeness[index] < UNLIKE
-        apart = c.path > FAR_FROM_ALL_M and today.touching > 1 - MIN_SHARE
+        apart = c.path > FAR_FROM_ALL_M and as_is.touching > 1 - MIN_SHARE
         if not (unlike or apart or not fits(c, view)):
             continue
         words = (
@@ -229,12 +229,12 @@ def check_agreement(views: Sequence[View], found: Sequence[Agreement]) -> list[F
         words = f"colour and depth of demonstration {low[0]} show different scenes" if low else ""
         return [Finding("colour and depth", "warning", words, numbers)] if low else []
     if len({view.depth.shape for view in views}) == 1:
-        moved, best, today = exchanged(views)
-        if moved > len(views) / 2 and best > CLEARLY * today:
+        moved, best, as_is = exchanged(views)
+        if moved > len(views) / 2 and best > CLEARLY * as_is:
             words = (
                 f"edges of depth are no edges of colour; with other colour images ({moved} of {len(views)}) they are"
             )
-            advice = f" ({best / max(today, 1e-9):.1f} times stronger): pair each depth image with its own colour image"
+            advice = f" ({best / max(as_is, 1e-9):.1f} times stronger): pair each depth image with its own colour image"
             cause = "colour and depth of different episodes"
             return [Finding("colour and depth", "error", words + advice, numbers, cause)]
     causes = [one.cause for one in found if one.cause]
@@ -248,16 +248,9 @@ def check_agreement(views: Sequence[View], found: Sequence[Agreement]) -> list[F
     return [Finding("colour and depth", "warning", words + advice, numbers, "colour and depth of different scenes")]
 
 
-def object_centre(view: View) -> FloatArray:
-    """Mean ``(3,)`` of the raised points, metres; NaN where there are none."""
-    points = view.points[view.raised & np.isfinite(view.depth)]
-    return points.mean(axis=0) if len(points) else np.full(3, np.nan)
-
-
 def scene_spread(views: Sequence[View]) -> float:
     """Root mean square distance of what is raised from its mean over the scenes, metres; NaN where unknown."""
-    centres = np.array([object_centre(view) for view in views])
-    centres = centres[np.isfinite(centres).all(axis=1)]
+    centres = np.array([view.object_centre for view in views if len(view.raised_points)])
     if len(centres) < 2:
         return float("nan")
     return float(np.sqrt(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean()))

@@ -12,7 +12,7 @@ from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.agreement import CLEARLY, Agreement, agreement
 from robust_instant_policy.sanity.consistency import gripper_poses
-from robust_instant_policy.sanity.contact import Path
+from robust_instant_policy.sanity.contact import GripperPath
 from robust_instant_policy.sanity.envelope import Envelope
 from robust_instant_policy.sanity.episodes import check_episodes
 from robust_instant_policy.sanity.finding import DemonstrationError, Finding, GeometryError, Severity, errors
@@ -26,7 +26,6 @@ from robust_instant_policy.sanity.images import (
     check_openings,
     check_palms,
     check_quaternions,
-    object_centre,
     scene_spread,
 )
 from robust_instant_policy.sanity.scene import TABLE_M, check_against_scenery, check_table
@@ -122,14 +121,14 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
 
     found += check_quaternions(demonstrations)
     trajectories = [demonstration.trajectory for demonstration in demonstrations]
-    paths = [Path.of(trajectory) for trajectory in trajectories]
+    paths = [GripperPath.of(trajectory) for trajectory in trajectories]
     poses = gripper_poses(trajectories)
-    today = evidence(views, paths, poses)
+    as_is = evidence(views, paths, poses)
     cameras = _check_cameras(views)
     found += cameras
-    found += check_contact(demonstrations, views, paths, poses, today)
+    found += check_contact(demonstrations, views, paths, poses, as_is)
     edges = [agreement(view) for view in views]
-    found += check_palms(today) + check_openings(demonstrations, views)
+    found += check_palms(as_is) + check_openings(demonstrations, views)
     found += check_agreement(views, edges)
     spread = scene_spread(views)
     if len(views) > 1 and np.isfinite(spread) and spread < ONE_SCENE_M:
@@ -150,9 +149,9 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
         plane,
         centre,
         Scenery.of(views) if fixed and same_size else None,
-        today,
+        as_is,
         np.array([edge.ratio for edge in edges if np.isfinite(edge.ratio)]),
-        np.array([object_centre(view) for view in views]),
+        np.array([view.object_centre for view in views]),
         spread,
     )
     return SetReport(tuple(found), Envelope.of(trajectories, plane), reference)
@@ -217,7 +216,7 @@ def _check_edges(found: Agreement, demonstrated: FloatArray) -> list[Finding]:
 
 def _check_novelty(view: View, known: Reference) -> list[Finding]:
     """How far what is raised lies from what was raised in the demonstrations."""
-    centre = object_centre(view)
+    centre = view.object_centre
     seen = known.object_centres[np.isfinite(known.object_centres).all(axis=1)]
     if not len(seen):
         return []

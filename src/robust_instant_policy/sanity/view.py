@@ -94,10 +94,19 @@ class View:
         return float(self.above_plane(self.observation.camera_pose[:3, 3]))
 
     @cached_property
+    def raised_points(self) -> FloatArray:
+        """``(N, 3)`` metres, world."""
+        return self.points[self.raised & np.isfinite(self.depth)]
+
+    @property
+    def object_centre(self) -> FloatArray:
+        """Mean ``(3,)`` of the raised points; NaN where there are none."""
+        return self.raised_points.mean(axis=0) if len(self.raised_points) else np.full(3, np.nan)
+
+    @cached_property
     def tree(self) -> cKDTree:
         """Nearest raised point; where nothing is raised, one far away."""
-        points = self.points[self.raised & np.isfinite(self.depth)]
-        return cKDTree(points if len(points) else np.full((1, 3), FAR_AWAY_M))
+        return cKDTree(self.raised_points if len(self.raised_points) else np.full((1, 3), FAR_AWAY_M))
 
     def above_plane(self, points: FloatArray) -> FloatArray:
         """Heights ``(...)`` of ``points (..., 3)`` above the table, metres."""
