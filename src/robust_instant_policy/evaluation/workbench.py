@@ -238,7 +238,6 @@ class RememberingPolicy:
 
     def __init__(self, bench: Workbench, policy: KeypointPolicy, demos: int):
         self._bench, self.policy, self._demos = bench, policy, demos
-        self.name = policy.name
 
     def plan(self, observation: Observation) -> Plan:
         return self._bench.plan(self.policy, self._demos, observation)

@@ -11,6 +11,8 @@ from scipy.ndimage import gaussian_gradient_magnitude, maximum_filter, minimum_f
 from scipy.optimize import linear_sum_assignment
 
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.sanity.finding import Finding, Severity
+from robust_instant_policy.sanity.geometry import MIN_SHARE
 from robust_instant_policy.sanity.hypotheses import TURNS
 from robust_instant_policy.sanity.view import View
 
@@ -20,6 +22,7 @@ FAR_SHIFTS = ((0.13, 0.07), (-0.11, 0.17), (0.21, -0.12), (-0.16, -0.19), (0.29,
 """Displacements, as shares of the image, at which depth and colour cannot agree but by chance."""
 NEAR_SHARE = 0.16  # of the image that a depth image may be displaced to be called not aligned
 CLEARLY = 1.35  # times as strong as by chance: edges agree
+DISTINCT_EDGES = 1.6  # times as strong as by chance, which does not happen by chance in a sound image
 NAMED = 1.25  # times as strong as now: a displacement or turn that explains it
 
 
@@ -94,3 +97,50 @@ def exchanged(views: Sequence[View]) -> tuple[int, float, float]:
     strength = np.array([[colour[e].mean() if e.any() else 0.0 for colour in colours] for e in edges])
     rows, order = linear_sum_assignment(-strength)
     return int((order != rows).sum()), float(strength[rows, order].mean()), float(np.diag(strength).mean())
+
+
+def check_agreement(views: Sequence[View], found: Sequence[Agreement]) -> list[Finding]:
+    """Whether colour and depth of the demonstrations show the same scenes."""
+    ratios = np.array([one.ratio for one in found])
+    if not np.isfinite(ratios).any():
+        return []
+    usual = float(np.nanmedian(ratios))
+    numbers = {"edges": usual}
+    if usual >= CLEARLY:
+        low = [i for i, one in enumerate(found) if one.ratio < 1 + (usual - 1) / 4]
+        words = f"colour and depth of demonstration {low[0]} show different scenes" if low else ""
+        return [Finding("colour and depth", "warning", words, numbers)] if low else []
+    if len({view.depth.shape for view in views}) == 1:
+        moved, best, as_is = exchanged(views)
+        if moved > len(views) / 2 and best > CLEARLY * as_is:
+            words = (
+                f"edges of depth are no edges of colour; with other colour images ({moved} of {len(views)}) they are"
+            )
+            advice = f" ({best / max(as_is, 1e-9):.1f} times stronger): pair each depth image with its own colour image"
+            cause = "colour and depth of different episodes"
+            return [Finding("colour and depth", "error", words + advice, numbers, cause)]
+    causes = [one.cause for one in found if one.cause]
+    kinds = [cause.split(" (")[0] for cause in causes]
+    common = max(set(kinds), key=kinds.count, default="")
+    if common and kinds.count(common) >= MIN_SHARE * len(found):
+        words = f"edges of depth are no edges of colour ({usual:.1f} times chance); with {common} they are"
+        return [Finding("colour and depth", "error", words, numbers, f"colour and depth: {common}")]
+    words = f"edges of depth are no edges of colour ({usual:.1f} times chance)"
+    advice = ": colour and depth are of different scenes or streams, or the objects look like the table"
+    return [Finding("colour and depth", "warning", words + advice, numbers, "colour and depth of different scenes")]
+
+
+def check_scene_agreement(found: Agreement, demonstrated: FloatArray) -> list[Finding]:
+    """An error where the images agree far less than in any demonstration, a warning where less than is usual.
+
+    Only far less than in all, because texture, such as wood grain, hides the edges of some sound scenes.
+    """
+    usual, lowest = (float(np.median(demonstrated)), float(demonstrated.min())) if len(demonstrated) else (0.0, 0.0)
+    if not np.isfinite(found.ratio) or usual < CLEARLY or found.ratio >= 1 + (usual - 1) / 3:
+        return []
+    severity: Severity = "error" if lowest >= DISTINCT_EDGES and found.ratio < 1 + (lowest - 1) / 3 else "warning"
+    cause = found.cause or "colour and depth of different scenes"
+    words = f"edges of depth are no edges of colour ({found.ratio:.1f} times chance, {usual:.1f} in the demonstrations)"
+    told = f"; with {found.cause} they are" if found.cause else ": colour and depth are of different scenes or streams"
+    numbers = {"edges": found.ratio, "usual": usual}
+    return [Finding("colour and depth", severity, words + told, numbers, f"colour and depth: {cause}")]

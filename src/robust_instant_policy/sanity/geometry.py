@@ -39,7 +39,7 @@ class Evidence:
 
     ``touching``: the path meets a raised surface; ``grasping``: so does the gripper where it closes (share of all
     closings); ``clear``: no fingertip is below the table and no palm inside a surface; ``level``: the camera is above
-    the table and the readings lie on one plane; ``consistency`` as in `Consistency`, 0 where it is unknown.
+    the table and the readings lie on one plane.
     """
 
     contacts: tuple[Contact, ...]
@@ -48,6 +48,20 @@ class Evidence:
     grasping: float
     clear: float
     level: float
+
+    @property
+    def touches(self) -> bool:
+        return self.touching >= MIN_SHARE or self.grasping >= MIN_SHARE
+
+    @property
+    def is_clear(self) -> bool:
+        return self.clear >= MIN_SHARE
+
+    @property
+    def is_right(self) -> bool:
+        """Whether nothing of it speaks against images and paths; what repeats may be unknown."""
+        repeats = not self.surroundings.score < CONSISTENT
+        return self.is_clear and self.touches and repeats and self.level > 0
 
     @property
     def total(self) -> float:

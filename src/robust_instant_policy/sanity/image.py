@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from robust_instant_policy.pointcloud import MILLIMETRES_ABOVE
@@ -52,3 +54,18 @@ def check_image(view: View) -> list[Finding]:
         advice = "; the camera's pose is turned, or the depth is wrong"
         found.append(Finding("table", severity, words + advice, {"tilt": view.tilt}, "camera turned"))
     return found
+
+
+def check_each_image(views: Sequence[View]) -> list[Finding]:
+    """`check_image` of every view, the same finding told once."""
+    told: dict[tuple[str, Severity], list[tuple[int, Finding]]] = {}
+    for index, view in enumerate(views):
+        for finding in check_image(view):
+            told.setdefault((finding.kind, finding.severity), []).append((index, finding))
+    result = []
+    for (kind, severity), cases in told.items():
+        index, first = cases[0]
+        where = "all demonstrations" if len(cases) == len(views) else f"{len(cases)} of {len(views)} demonstrations"
+        where = f"demonstration {index}" if len(cases) == 1 else f"{where}, such as {index}"
+        result.append(Finding(kind, severity, f"{where}: {first.message}", first.numbers, first.cause))
+    return result

@@ -1,4 +1,4 @@
-"""The images of a set of demonstrations against its paths, and against each other."""
+"""The images of a set of demonstrations against its paths."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.sanity.agreement import CLEARLY, Agreement, exchanged
 from robust_instant_policy.sanity.consistency import MIN_DEMONSTRATIONS
 from robust_instant_policy.sanity.contact import GripperPath, gaps
 from robust_instant_policy.sanity.envelope import approaches
@@ -25,7 +24,6 @@ from robust_instant_policy.sanity.geometry import (
     touch_distance,
 )
 from robust_instant_policy.sanity.hypotheses import reordered_quaternions
-from robust_instant_policy.sanity.image import check_image
 from robust_instant_policy.sanity.view import View
 
 OWN_BETTER = 0.2  # by which the own images' consistency must exceed that of other images
@@ -40,21 +38,6 @@ LESS_CONSISTENT = 0.05  # by which the consistency under a hypothesis may be low
 STRAIGHT_RAD, CROOKED_RAD = np.deg2rad([3.5, 10.0])  # spread of the approach with quaternions in order, or not
 
 
-def check_each_image(views: Sequence[View]) -> list[Finding]:
-    """`check_image` of every view, the same finding told once."""
-    told: dict[tuple[str, Severity], list[tuple[int, Finding]]] = {}
-    for index, view in enumerate(views):
-        for finding in check_image(view):
-            told.setdefault((finding.kind, finding.severity), []).append((index, finding))
-    result = []
-    for (kind, severity), cases in told.items():
-        index, first = cases[0]
-        where = "all demonstrations" if len(cases) == len(views) else f"{len(cases)} of {len(views)} demonstrations"
-        where = f"demonstration {index}" if len(cases) == 1 else f"{where}, such as {index}"
-        result.append(Finding(kind, severity, f"{where}: {first.message}", first.numbers, first.cause))
-    return result
-
-
 def check_contact(
     demonstrations: Sequence[Demonstration],
     views: Sequence[View],
@@ -64,15 +47,12 @@ def check_contact(
 ) -> list[Finding]:
     """Whether the paths meet what their images show; if not, why."""
     count, score = len(views), as_is.surroundings.score
-    touches = as_is.touching >= MIN_SHARE or as_is.grasping >= MIN_SHARE
-    repeats = not np.isfinite(score) or score >= CONSISTENT
     own, other = score, float("nan")
     if count > MIN_DEMONSTRATIONS and scene_spread(views) > ONE_SCENE_M:
         own, other = pairing_scores(views, poses)
-    exchangeable = own < other + OWN_BETTER
-    is_clear, closes = as_is.clear >= MIN_SHARE, any(len(c.grasps) for c in as_is.contacts)
-    right = is_clear and touches and repeats and as_is.level > 0 and not exchangeable
-    if right and np.mean([c.path < CLOSE_M for c in as_is.contacts]) >= MIN_SHARE:
+    right = as_is.is_right and not own < other + OWN_BETTER
+    near = np.mean([c.path < CLOSE_M for c in as_is.contacts]) >= MIN_SHARE
+    if right and (near or count <= MIN_DEMONSTRATIONS):
         return _outliers(views, as_is)
     numbers = {
         "path_gap": as_is.path_gap,
@@ -83,39 +63,46 @@ def check_contact(
         "touching": as_is.touching,
         "clear": as_is.clear,
     }
-    explanation = None if right and count <= MIN_DEMONSTRATIONS else explain(demonstrations, paths, poses)
-    if explanation and right and explanation.evidence.surroundings.score < score - LESS_CONSISTENT:
-        explanation = None  # nearer by chance: what it shows around the gripper repeats less
-    if explanation:
+    explanation = explain(demonstrations, paths, poses)
+    # a hypothesis under which the surroundings repeat less comes nearer by chance
+    if explanation and not (right and explanation.evidence.surroundings.score < score - LESS_CONSISTENT):
         words = f"{_measured(as_is)}; {_explained(explanation)}"
         # where the images do fit as they are, a hypothesis that fits better proves nothing
-        severity: Severity = "warning" if right or (touches and is_clear and explanation.displaced) else "error"
-        return [Finding("contact", severity, words, numbers, explanation.cause)]
+        fits_as_is = right or (as_is.touches and as_is.is_clear and explanation.displaced)
+        return [Finding("contact", "warning" if fits_as_is else "error", words, numbers, explanation.cause)]
     if right:
         return _outliers(views, as_is)
-    if is_clear and not any(view.raised.any() for view in views):
+    severity, words, cause = _unexplained(views, as_is, own, other)
+    return [Finding("contact", severity, words, numbers, cause)]
+
+
+def _unexplained(views: Sequence[View], as_is: Evidence, own: float, other: float) -> tuple[Severity, str, str]:
+    """Severity, words and cause where no hypothesis fits; consistency with the ``own`` and ``other`` images."""
+    closes = any(len(c.grasps) for c in as_is.contacts)
+    if not as_is.is_clear:
+        return "error", f"{_measured(as_is)}; check the camera's pose, the depth unit and the tool's offset", ""
+    if not any(view.raised.any() for view in views):
         words = "nothing in the images stands above the table: whether images and paths belong together was not checked"
-        return [Finding("contact", "warning" if closes else "unchecked", words, numbers, "flat depth: nothing raised")]
-    if not is_clear:
-        advice = "; check the camera's pose, the depth unit and the tool's offset"
-        return [Finding("contact", "error", _measured(as_is) + advice, numbers)]
-    if not touches:
-        advice = "; check the camera's pose, the tool's offset and which image belongs to which path"
-        words = _measured(as_is) + (advice if closes else "; nothing closes there, so it was not checked further")
-        return [Finding("contact", "error" if closes else "warning", words, numbers)]
-    if exchangeable:
+        return "warning" if closes else "unchecked", words, "flat depth: nothing raised"
+    if not as_is.touches and closes:
+        advice = "check the camera's pose, the tool's offset and which image belongs to which path"
+        return "error", f"{_measured(as_is)}; {advice}", ""
+    if not as_is.touches:
+        return "warning", f"{_measured(as_is)}; nothing closes there, so it was not checked further", ""
+    if own < other + OWN_BETTER:
         words = f"the paths fit their own images no better than each other's ({own:.2f} against {other:.2f} of 1)"
-        advice = "; trajectories are shuffled against images, or the images are mirrored, or of another camera"
-        return [Finding("contact", "error", words + advice, numbers, "other images")]
+        advice = "trajectories are shuffled against images, or the images are mirrored, or of another camera"
+        return "error", f"{words}; {advice}", "other images"
+    score = as_is.surroundings.score
     words = f"what the images show around the gripper hardly repeats across the demonstrations ({score:.2f} of 1)"
-    return [Finding("contact", "unchecked", f"{words}: whether the camera is right was not decided", numbers)]
+    return "unchecked", f"{words}: whether the camera is right was not decided", ""
 
 
 def _measured(as_is: Evidence) -> str:
     """What is wrong with the evidence, worst first."""
     if as_is.lowest < -TOUCH_M:
         return f"fingertips reach {-as_is.lowest * 1e3:.0f} mm below the table that the images show"
-    if as_is.clear < MIN_SHARE:
+    if not as_is.is_clear:
         buried = float(np.median([c.buried for c in as_is.contacts]))
         return f"the palm passes {buried * 1e3:.0f} mm deep through what the images show"
     if as_is.touching < MIN_SHARE:
@@ -123,8 +110,7 @@ def _measured(as_is: Evidence) -> str:
             grasps = f"grasp points lie {as_is.grasp_gap:.2f} m from any surface"
             return f"{grasps}, and no path comes nearer than {as_is.path_gap:.2f} m"
         return f"paths come no nearer than {as_is.path_gap:.2f} m to any surface"
-    score = as_is.surroundings.score
-    if np.isfinite(score) and score < CONSISTENT:
+    if (score := as_is.surroundings.score) < CONSISTENT:
         return f"what the images show around the gripper does not repeat across the demonstrations ({score:.2f} of 1)"
     if as_is.level > 0:
         return f"paths come within {as_is.path_gap * 1e3:.0f} mm of what the images show"
@@ -215,37 +201,6 @@ def _spread(directions: FloatArray) -> float:
     mean = directions.mean(axis=0)
     mean /= max(float(np.linalg.norm(mean)), 1e-9)
     return float(np.percentile(np.arccos(np.clip(directions @ mean, -1, 1)), 90))
-
-
-def check_agreement(views: Sequence[View], found: Sequence[Agreement]) -> list[Finding]:
-    """Whether colour and depth of the demonstrations show the same scenes."""
-    ratios = np.array([one.ratio for one in found])
-    if not np.isfinite(ratios).any():
-        return []
-    usual = float(np.nanmedian(ratios))
-    numbers = {"edges": usual}
-    if usual >= CLEARLY:
-        low = [i for i, one in enumerate(found) if one.ratio < 1 + (usual - 1) / 4]
-        words = f"colour and depth of demonstration {low[0]} show different scenes" if low else ""
-        return [Finding("colour and depth", "warning", words, numbers)] if low else []
-    if len({view.depth.shape for view in views}) == 1:
-        moved, best, as_is = exchanged(views)
-        if moved > len(views) / 2 and best > CLEARLY * as_is:
-            words = (
-                f"edges of depth are no edges of colour; with other colour images ({moved} of {len(views)}) they are"
-            )
-            advice = f" ({best / max(as_is, 1e-9):.1f} times stronger): pair each depth image with its own colour image"
-            cause = "colour and depth of different episodes"
-            return [Finding("colour and depth", "error", words + advice, numbers, cause)]
-    causes = [one.cause for one in found if one.cause]
-    kinds = [cause.split(" (")[0] for cause in causes]
-    common = max(set(kinds), key=kinds.count, default="")
-    if common and kinds.count(common) >= MIN_SHARE * len(found):
-        words = f"edges of depth are no edges of colour ({usual:.1f} times chance); with {common} they are"
-        return [Finding("colour and depth", "error", words, numbers, f"colour and depth: {common}")]
-    words = f"edges of depth are no edges of colour ({usual:.1f} times chance)"
-    advice = ": colour and depth are of different scenes or streams, or the objects look like the table"
-    return [Finding("colour and depth", "warning", words + advice, numbers, "colour and depth of different scenes")]
 
 
 def scene_spread(views: Sequence[View]) -> float:

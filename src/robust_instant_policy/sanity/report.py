@@ -10,19 +10,17 @@ import numpy as np
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.sanity.agreement import CLEARLY, Agreement, agreement
+from robust_instant_policy.sanity.agreement import agreement, check_agreement, check_scene_agreement
 from robust_instant_policy.sanity.consistency import gripper_poses
 from robust_instant_policy.sanity.contact import GripperPath
 from robust_instant_policy.sanity.envelope import Envelope
 from robust_instant_policy.sanity.episodes import check_episodes
 from robust_instant_policy.sanity.finding import DemonstrationError, Finding, GeometryError, Severity, errors
 from robust_instant_policy.sanity.geometry import Evidence, evidence
-from robust_instant_policy.sanity.image import check_image
+from robust_instant_policy.sanity.image import check_each_image, check_image
 from robust_instant_policy.sanity.images import (
     ONE_SCENE_M,
-    check_agreement,
     check_contact,
-    check_each_image,
     check_openings,
     check_palms,
     check_quaternions,
@@ -32,7 +30,6 @@ from robust_instant_policy.sanity.scene import TABLE_M, check_against_scenery, c
 from robust_instant_policy.sanity.scenery import Scenery, camera_change
 from robust_instant_policy.sanity.view import View
 
-DISTINCT_EDGES = 1.6  # ratio of colour and depth edges that chance does not reach in a sound image
 OUTSIDE_SPREADS = 3.0  # times the demonstrations' spread, and
 OUTSIDE_M = 0.05  # at least this far from every demonstration's objects, a scene lies outside
 
@@ -88,7 +85,7 @@ class SetReport:
         if known.scenery is not None:
             found += check_against_scenery(view, known.scenery)
         found += check_table(view, known.plane, known.centre)
-        found += _check_edges(agreement(view), known.edges)
+        found += check_scene_agreement(agreement(view), known.edges)
         return (*found, *_check_novelty(view, known))
 
     def require_observation(self, observation: Observation) -> tuple[Finding, ...]:
@@ -196,22 +193,6 @@ def _check_planes(views: Sequence[View]) -> list[Finding]:
         return []
     words = f"the table's height differs by {off * 100:.1f} cm between demonstrations: a camera pose or depth is wrong"
     return [Finding("camera", "error", words, {"table_offset": off}, "camera pose changed")]
-
-
-def _check_edges(found: Agreement, demonstrated: FloatArray) -> list[Finding]:
-    """An error where the images agree far less than in any demonstration, a warning where less than is usual.
-
-    Only far less than in all, because texture, such as wood grain, hides the edges of some sound scenes.
-    """
-    usual, lowest = (float(np.median(demonstrated)), float(demonstrated.min())) if len(demonstrated) else (0.0, 0.0)
-    if not np.isfinite(found.ratio) or usual < CLEARLY or found.ratio >= 1 + (usual - 1) / 3:
-        return []
-    severity: Severity = "error" if lowest >= DISTINCT_EDGES and found.ratio < 1 + (lowest - 1) / 3 else "warning"
-    cause = found.cause or "colour and depth of different scenes"
-    words = f"edges of depth are no edges of colour ({found.ratio:.1f} times chance, {usual:.1f} in the demonstrations)"
-    told = f"; with {found.cause} they are" if found.cause else ": colour and depth are of different scenes or streams"
-    numbers = {"edges": found.ratio, "usual": usual}
-    return [Finding("colour and depth", severity, words + told, numbers, f"colour and depth: {cause}")]
 
 
 def _check_novelty(view: View, known: Reference) -> list[Finding]:
