@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -105,16 +105,11 @@ DISPLACED = tuple(
 ALL = OF_POSE + OF_INTRINSICS + OF_DEPTH + OF_IMAGES
 
 
-def reordered_quaternions(triplets: FloatArray) -> tuple[tuple[str, FloatArray], ...]:
-    """``triplets (..., 3, 3)`` with the rotation that they have if quaternions are read in the other order."""
+def reordered_quaternions(triplets: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    """Each other order of quaternions, and ``triplets (N, 3, 3)`` with the rotation that they have if read in it."""
     triangle = GripperTriangle.from_triplets(triplets)
     poses = triangle.poses(triplets)
-    flat = Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3)).as_quat()
-    found = []
-    for words, roll in (("wxyz", -1), ("xyzw", 1)):
-        other = poses.copy()
-        other[..., :3, :3] = (
-            Rotation.from_quat(np.roll(flat, roll, axis=1)).as_matrix().reshape(*poses.shape[:-2], 3, 3)
-        )
-        found.append((f"quaternions read as {words}", triangle.triplets(other)))
-    return tuple(found)
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    for order, roll in (("wxyz", -1), ("xyzw", 1)):
+        poses[:, :3, :3] = Rotation.from_quat(np.roll(quaternions, roll, axis=1)).as_matrix()
+        yield f"quaternions read as {order}", triangle.triplets(poses)
