@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from robust_instant_policy.evaluation import (
     Episode,
     Progress,
     Setup,
+    Suite,
     Variant,
     make_suites,
     run_suites,
@@ -92,25 +94,15 @@ def run(options: argparse.Namespace) -> int:
         LocalWorkers(options.workers or 1) if options.ray is None else RayWorkers(options.ray, options.workers)
     )
     suites = make_suites(options.suite or ["chosen"], choice)
-    screen = StageConsole()
-    with screen.stage("evaluation"):
-        run_suites(
-            suites,
-            setup,
-            options.out,
-            workers,
-            _progress(screen, options.out),
-            ["rip", *options.arguments],
-            options.keep,
-        )
-    screen.say("")
-    screen.say(publish(options.out))
-    screen.say(f"rows: {options.out / EPISODES_FILE}; all of it: {options.out / PAGE_FILE}")
+    evaluate(suites, setup, options.out, workers, ["rip", *options.arguments], options.keep)
     return 0
 
 
-def _progress(screen: StageConsole, out: Path) -> Progress:
-    """Rows and bars on the ``screen``, and a picture of each training in ``out``."""
+def evaluate(
+    suites: Sequence[Suite], setup: Setup, out: Path, workers: Workers, arguments: Sequence[str], keep: bool
+) -> None:
+    """Run what is missing of ``suites`` in ``out``, on the screen; then tables, figures and page. See `run_suites`."""
+    screen = StageConsole()
 
     def recording(task: str, there: int, count: int, thrown_away: int) -> None:
         screen.done_so_far(f"{task}: recording ({thrown_away} thrown away)", there, count)
@@ -126,6 +118,11 @@ def _progress(screen: StageConsole, out: Path) -> Progress:
             screen.say(f"  {what.scene} {what.variant} #{what.candidate}: {verdict}")
         screen.done_so_far("plans executed", done, total)
 
-    return Progress(
+    progress = Progress(
         recording, outcome, TrainingScreen(screen), trained=partial(keep_training_picture, out), note=screen.say
     )
+    with screen.stage("evaluation"):
+        run_suites(suites, setup, out, workers, progress, arguments, keep)
+    screen.say("")
+    screen.say(publish(out))
+    screen.say(f"rows: {out / EPISODES_FILE}; all of it: {out / PAGE_FILE}")
