@@ -1,0 +1,141 @@
+"""Foreground of one RGB-D image: its XYZRGB points that do not belong to the table, in connected segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label, maximum_filter, uniform_filter
+
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.errors import KeypointError
+from robust_instant_policy.geometry import FloatArray, lift
+from robust_instant_policy.perception.descriptors import DescriptorMap, Float32Array, IntArray
+from robust_instant_policy.pointcloud import in_metres, steady, table_plane
+
+MAX_EDGE_PX = 256  # larger images are subsampled: enough for millimetres, and fast
+MIN_STEADY_PIXELS = 100
+MIN_FOREGROUND_POINTS = 25
+MIN_HEIGHT_M = 0.010  # above the table, for points of objects,
+MIN_HEIGHT_DEVIATIONS = 4.0  # or this many standard deviations of the depth noise, if that is more
+MAD_TO_DEVIATION = 1.4826  # standard deviation of a Gaussian with median absolute deviation 1
+MIN_DISTANCE_SMOOTHED = 4.0  # Mahalanobis distance of a flat point's smoothed colour from the table's,
+MIN_DISTANCE_POINT = 2.5  # and of its own colour, so that smoothing adds no border to objects
+SMOOTHING_PX = 5  # evens out the grain of the table
+COLOUR_SAMPLES = 1000
+TRIM_ROUNDS = 4
+TRIM_DEVIATIONS = 3.0
+COLOUR_NOISE = 0.02  # standard deviation of the camera's noise in a colour channel, of a range of 1
+SEGMENT_GAP_M = 0.02  # foreground points further apart in the image belong to different segments
+MIN_SEGMENT_POINTS = 15
+COLOUR_SCALE_M = 0.06  # metres in an XYZRGB point for the difference between black and white in one channel
+
+
+@dataclass(frozen=True, eq=False)
+class Foreground:
+    """``points (N, 3)`` in metres, world, and the same as ``xyzrgb (N, 6)`` in metres, colours in units of
+    `COLOUR_SCALE_M`; ``cells (N,)`` of the descriptor map; ``segments``: the points' numbers, by connected component.
+    """
+
+    points: FloatArray
+    xyzrgb: Float32Array
+    cells: IntArray
+    segments: tuple[IntArray, ...]
+
+
+def segment_foreground(
+    observation: Observation, descriptors: DescriptorMap, salient: float, workspace: FloatArray | None, seed: int
+) -> tuple[Foreground, Float32Array, str]:
+    """Foreground and depth ``(H, W)`` in metres of an image, and a note if the depth was in another unit.
+
+    A point is foreground by its height above the table, or, when flat, by the network's saliency (above ``salient``)
+    and a colour that differs from the table's. Points outside ``workspace (2, 3)``, metres, world, are not foreground;
+    its lower z is ignored. Raises `KeypointError` if depth readings or foreground points are too few.
+    """
+    depth, note = in_metres(observation.depth)
+    if not np.isfinite(depth).any():
+        raise KeypointError("the depth image has no reading at all; check the camera's depth stream")
+    stride = -(-max(depth.shape) // MAX_EDGE_PX)
+    usable = steady(depth)[::stride, ::stride]
+    pixels = np.argwhere(usable)[:, ::-1] * stride
+    if len(pixels) < MIN_STEADY_PIXELS:
+        raise KeypointError(f"only {len(pixels)} pixels have a steady depth; check the camera's depth stream")
+    points = lift(pixels, depth[pixels[:, 1], pixels[:, 0]], observation.intrinsics, observation.camera_pose)
+    if workspace is not None:
+        inside = ((points >= workspace[0]) & (points <= workspace[1]))[:, :2].all(axis=1)
+        if inside.sum() < MIN_STEADY_PIXELS:
+            raise KeypointError(
+                f"only {inside.sum()} points of the image lie in the workspace; check it and the camera's pose"
+            )
+        points, pixels = points[inside], pixels[inside]
+    cells = descriptors.cells_at(pixels)
+    chosen = _raised(points, seed)
+    chosen |= _differs_from_table(observation.rgb, pixels, chosen, descriptors.saliency.flat[cells] > salient)
+    if workspace is not None:
+        chosen &= points[:, 2] <= workspace[1][2]
+
+    kept = np.flatnonzero(chosen)
+    place = tuple(pixels[kept, ::-1].T // stride)
+    mask = np.zeros_like(usable)
+    mask[place] = True
+    gap = SEGMENT_GAP_M * observation.intrinsics[0, 0] / np.nanmedian(depth) / stride
+    labels = label(maximum_filter(mask, size=max(1, round(gap))), structure=np.ones((3, 3)))[0][place]
+    large = np.bincount(labels, minlength=1)[labels] >= MIN_SEGMENT_POINTS
+    kept, labels = kept[large], labels[large]
+    if len(kept) < MIN_FOREGROUND_POINTS:
+        raise KeypointError("nothing stands out from the table in an image; is the object in the workspace?")
+    colours = _colours(observation.rgb, pixels[kept])
+    xyzrgb = np.concatenate([points[kept], colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
+    segments = tuple(np.flatnonzero(labels == segment) for segment in np.unique(labels))
+    return Foreground(points[kept], xyzrgb, cells[kept], segments), depth, note
+
+
+def _raised(points: FloatArray, seed: int) -> NDArray[np.bool_]:
+    """Which of ``points (N, 3)`` are higher above the table's plane than its noise."""
+    plane = table_plane(points, seed)
+    height = points @ plane[:3] + plane[3]
+    of_table = np.abs(height)[np.abs(height) < MIN_HEIGHT_M]
+    noise = MAD_TO_DEVIATION * np.median(of_table) if len(of_table) else 0.0
+    return height > max(MIN_HEIGHT_M, MIN_HEIGHT_DEVIATIONS * noise)
+
+
+def _differs_from_table(
+    rgb: NDArray[np.uint8], pixels: IntArray, raised: NDArray[np.bool_], salient: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Which of ``pixels (N, 2)`` are not ``raised``, but ``salient`` and of another colour than the table."""
+    flat = pixels if raised.all() else pixels[~raised]
+    mean, whitening = _fit_table_colour(_colours(rgb, flat[:: max(1, len(flat) // COLOUR_SAMPLES)]))
+
+    def distances(image: NDArray[np.uint8], at: IntArray) -> Float32Array:
+        colours = _colours(image, at)
+        # A shadow has the table's colour, darker: darker points are scaled up to the table's brightness.
+        brightness = np.maximum(colours.mean(axis=1), COLOUR_NOISE)
+        return _mahalanobis(colours * np.maximum(mean.mean() / brightness, 1)[:, None], mean, whitening)
+
+    candidates = np.flatnonzero(salient & ~raised)
+    smoothed = uniform_filter(rgb, size=(SMOOTHING_PX, SMOOTHING_PX, 1))
+    result = np.zeros(len(pixels), dtype=bool)
+    result[candidates] = (distances(smoothed, pixels[candidates]) > MIN_DISTANCE_SMOOTHED) & (
+        distances(rgb, pixels[candidates]) > MIN_DISTANCE_POINT
+    )
+    return result
+
+
+def _fit_table_colour(colours: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Centre ``(3,)`` and whitening ``(3, 3)`` of a Gaussian fitted to ``colours (N, 3)``, outliers trimmed."""
+    for _ in range(TRIM_ROUNDS):
+        mean = np.median(colours, axis=0)
+        covariance = np.cov(colours.T) + COLOUR_NOISE**2 * np.eye(3)
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance)).T.astype(np.float32)
+        colours = colours[_mahalanobis(colours, mean, whitening) < TRIM_DEVIATIONS]
+    return mean, whitening
+
+
+def _mahalanobis(colours: Float32Array, mean: Float32Array, whitening: Float32Array) -> Float32Array:
+    return np.sqrt((((colours - mean) @ whitening) ** 2).sum(axis=1))
+
+
+def _colours(rgb: NDArray[np.uint8], pixels: IntArray) -> Float32Array:
+    """Colours ``(N, 3)`` in [0, 1] at ``pixels (N, 2)``."""
+    return np.divide(rgb[pixels[:, 1], pixels[:, 0]], 255, dtype=np.float32)
