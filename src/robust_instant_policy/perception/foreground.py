@@ -70,8 +70,13 @@ def segment_foreground(
             )
         points, pixels = points[inside], pixels[inside]
     cells = descriptors.cells_at(pixels)
-    chosen = _raised(points, seed)
-    chosen |= _differs_from_table(observation.rgb, pixels, chosen, descriptors.saliency.flat[cells] > salient)
+    at = pixels[:, 1], pixels[:, 0]
+    colours = np.divide(observation.rgb[at], 255, dtype=np.float32)
+    smoothed = np.divide(uniform_filter(observation.rgb, (SMOOTHING_PX, SMOOTHING_PX, 1))[at], 255, dtype=np.float32)
+    raised = _raised(points, seed)
+    table = TableColour.fit(colours if raised.all() else colours[~raised])
+    unlike_table = (table.distance(smoothed) > MIN_DISTANCE_SMOOTHED) & (table.distance(colours) > MIN_DISTANCE_POINT)
+    chosen = raised | (unlike_table & (descriptors.saliency.flat[cells] > salient))
     if workspace is not None:
         chosen &= points[:, 2] <= workspace[1][2]
 
@@ -85,8 +90,7 @@ def segment_foreground(
     kept, labels = kept[large], labels[large]
     if len(kept) < MIN_FOREGROUND_POINTS:
         raise KeypointError("nothing stands out from the table in an image; is the object in the workspace?")
-    colours = _colours(observation.rgb, pixels[kept])
-    xyzrgb = np.concatenate([points[kept], colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
+    xyzrgb = np.concatenate([points[kept], colours[kept] * COLOUR_SCALE_M], axis=1).astype(np.float32)
     segments = tuple(np.flatnonzero(labels == segment) for segment in np.unique(labels))
     return Foreground(points[kept], xyzrgb, cells[kept], segments), depth, note
 
@@ -100,42 +104,31 @@ def _raised(points: FloatArray, seed: int) -> NDArray[np.bool_]:
     return height > max(MIN_HEIGHT_M, MIN_HEIGHT_DEVIATIONS * noise)
 
 
-def _differs_from_table(
-    rgb: NDArray[np.uint8], pixels: IntArray, raised: NDArray[np.bool_], salient: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Which of ``pixels (N, 2)`` are not ``raised``, but ``salient`` and of another colour than the table."""
-    flat = pixels if raised.all() else pixels[~raised]
-    mean, whitening = _fit_table_colour(_colours(rgb, flat[:: max(1, len(flat) // COLOUR_SAMPLES)]))
+@dataclass(frozen=True, eq=False)
+class TableColour:
+    """Gaussian of the table's colours in [0, 1]: ``mean (3,)``; ``whitening (3, 3)`` maps to unit covariance."""
 
-    def distances(image: NDArray[np.uint8], at: IntArray) -> Float32Array:
-        colours = _colours(image, at)
-        # A shadow has the table's colour, darker: darker points are scaled up to the table's brightness.
+    mean: Float32Array
+    whitening: Float32Array
+
+    @classmethod
+    def fit(cls, colours: Float32Array) -> TableColour:
+        """Fitted to ``colours (N, 3)``, outliers trimmed."""
+        colours = colours[:: max(1, len(colours) // COLOUR_SAMPLES)]
+        for _ in range(TRIM_ROUNDS):
+            covariance = np.cov(colours.T) + COLOUR_NOISE**2 * np.eye(3)
+            whitening = np.linalg.inv(np.linalg.cholesky(covariance)).T.astype(np.float32)
+            table = cls(np.median(colours, axis=0), whitening)
+            colours = colours[table._mahalanobis(colours) < TRIM_DEVIATIONS]
+        return table
+
+    def distance(self, colours: Float32Array) -> Float32Array:
+        """Mahalanobis distances ``(N,)`` of ``colours (N, 3)``, each first scaled up to the table's brightness.
+
+        A shadow has the table's colour, darker.
+        """
         brightness = np.maximum(colours.mean(axis=1), COLOUR_NOISE)
-        return _mahalanobis(colours * np.maximum(mean.mean() / brightness, 1)[:, None], mean, whitening)
+        return self._mahalanobis(colours * np.maximum(self.mean.mean() / brightness, 1)[:, None])
 
-    candidates = np.flatnonzero(salient & ~raised)
-    smoothed = uniform_filter(rgb, size=(SMOOTHING_PX, SMOOTHING_PX, 1))
-    result = np.zeros(len(pixels), dtype=bool)
-    result[candidates] = (distances(smoothed, pixels[candidates]) > MIN_DISTANCE_SMOOTHED) & (
-        distances(rgb, pixels[candidates]) > MIN_DISTANCE_POINT
-    )
-    return result
-
-
-def _fit_table_colour(colours: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Centre ``(3,)`` and whitening ``(3, 3)`` of a Gaussian fitted to ``colours (N, 3)``, outliers trimmed."""
-    for _ in range(TRIM_ROUNDS):
-        mean = np.median(colours, axis=0)
-        covariance = np.cov(colours.T) + COLOUR_NOISE**2 * np.eye(3)
-        whitening = np.linalg.inv(np.linalg.cholesky(covariance)).T.astype(np.float32)
-        colours = colours[_mahalanobis(colours, mean, whitening) < TRIM_DEVIATIONS]
-    return mean, whitening
-
-
-def _mahalanobis(colours: Float32Array, mean: Float32Array, whitening: Float32Array) -> Float32Array:
-    return np.sqrt((((colours - mean) @ whitening) ** 2).sum(axis=1))
-
-
-def _colours(rgb: NDArray[np.uint8], pixels: IntArray) -> Float32Array:
-    """Colours ``(N, 3)`` in [0, 1] at ``pixels (N, 2)``."""
-    return np.divide(rgb[pixels[:, 1], pixels[:, 0]], 255, dtype=np.float32)
+    def _mahalanobis(self, colours: Float32Array) -> Float32Array:
+        return np.sqrt((((colours - self.mean) @ self.whitening) ** 2).sum(axis=1))

@@ -83,14 +83,10 @@ def _model(views: Sequence[View], xyzrgb: Float32Array, seed: int) -> RigidObjec
     return RigidObject(tuple(templates), tuple(registrations))
 
 
-def _template(
-    view: View, to_reference: FloatArray, xyzrgb: Float32Array, known: Float32Array, seed: int
-) -> Template:
+def _template(view: View, to_reference: FloatArray, xyzrgb: Float32Array, known: Float32Array, seed: int) -> Template:
     """Of ``xyzrgb (N, 6)`` and of the cells near ``known (M, 6)``, both in the reference image's frame."""
     points = transform_points(to_reference, view.cell_points)
-    near = subsample(
-        np.flatnonzero(cKDTree(known[:, :3]).query(points)[0] < SAME_OBJECT_M), MAX_TEMPLATE_CELLS, seed
-    )
+    near = subsample(np.flatnonzero(cKDTree(known[:, :3]).query(points)[0] < SAME_OBJECT_M), MAX_TEMPLATE_CELLS, seed)
     kept = subsample(np.arange(len(xyzrgb)), MAX_TEMPLATE_POINTS, seed)
     return Template(view, xyzrgb[kept], view.cells[near], points[near])
 

@@ -1,8 +1,7 @@
 """Descriptors and saliency of a vision transformer (Amir et al. 2022, "Deep ViT Features as Dense Visual Descriptors").
 
-One pass through the model gives both: a facet of one layer as descriptors, and the attention that the class token pays
-to each patch in the last layer as saliency. `transformers` runs the model; what it lacks stands here: patches that
-overlap, DINO's interpolation of position encodings, the facets, and the saliency.
+Descriptors are a facet of one layer, saliency the attention of the class token to each patch in the last layer.
+`transformers` runs the model; this file adds overlapping patches and DINO's interpolation of position encodings.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from robust_instant_policy.perception.descriptors import DescriptorMap
 from robust_instant_policy.perception.settings import FACETS, DescriptorSettings
 from robust_instant_policy.perception.vit_checkpoint import VitCheckpoint
 
-POSITION_OFFSET = 0.1  # DINO adds it to the grid before interpolating positions, against rounding
+POSITION_OFFSET = 0.1  # patches that DINO adds to the grid before the interpolation, against rounding
 DINO_SALIENT_HEADS = (0, 2, 4, 5)  # of ViT-S's six; the reference averages these (Amir et al. 2022)
 PROJECTIONS = {"query": ("q_proj", "query"), "key": ("k_proj", "key"), "value": ("v_proj", "value")}
 
@@ -29,7 +28,7 @@ PROJECTIONS = {"query": ("q_proj", "query"), "key": ("k_proj", "key"), "value": 
 class VisionTransformer:
     """A frozen vision transformer whose patches may overlap.
 
-    ``stride`` divides the patch size; position encodings are interpolated onto the denser grid.
+    ``stride``, in pixels, must divide the patch size; position encodings are interpolated to the denser grid.
     """
 
     def __init__(self, model: Any, stride: int):
@@ -43,9 +42,9 @@ class VisionTransformer:
 
     @torch.inference_mode()
     def features(self, batch: torch.Tensor, layer: int, facet: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Descriptors ``(rows, cols, D)`` of a facet and saliency ``(rows, cols)`` in [0, 1] of one normalised image.
+        """Descriptors ``(rows, cols, D)``, a facet of a layer, and saliency ``(rows, cols)`` in [0, 1].
 
-        ``batch`` is ``(1, 3, H, W)``. Of the last layer's attention only the class token's row is computed.
+        ``batch (1, 3, H, W)`` is one normalised image. Raises `InvalidValueError` for unknown layers and facets.
         """
         if not 0 <= layer < len(self._layers):
             raise InvalidValueError(f"layer must be 0 to {len(self._layers) - 1}, got {layer}")
@@ -86,20 +85,18 @@ class VisionTransformer:
         saliency = (saliency - saliency.min()) / (saliency.max() - saliency.min()).clamp_min(1e-12)
         wanted = seen["wanted"]
         if facet != "token":
-            wanted = (
-                wanted.unflatten(2, (heads, -1)).transpose(2, 3).flatten(2)
-            )  # the reference's order: heads innermost
+            wanted = wanted.unflatten(2, (heads, -1)).transpose(2, 3).flatten(2)  # heads innermost, as the reference
         return wanted[0, special:].reshape(*grid, -1), saliency.reshape(grid)
 
     def positions(self, rows: int, cols: int) -> torch.Tensor:
-        """Position encodings ``(1, 1 + rows · cols, D)`` for a denser or larger grid than the trained one."""
+        """Position encodings ``(1, 1 + rows · cols, D)``, interpolated from the trained grid."""
         table = self._model.embeddings.position_embeddings
         side = math.isqrt(table.shape[1] - 1)
         if (rows, cols) == (side, side):
             return table
         square = table[:, 1:].reshape(1, side, side, -1).permute(0, 3, 1, 2)
         if self.config.model_type == "vit":
-            # By scale factor, as DINO does it: the offset shifts every sample a little, and the weights expect that.
+            # By scale factor, as in DINO: the offset shifts every sample, and the weights were trained with it.
             scale = ((rows + POSITION_OFFSET) / side, (cols + POSITION_OFFSET) / side)
             dense = F.interpolate(square, scale_factor=scale, mode="bicubic", recompute_scale_factor=False)
         else:
@@ -109,12 +106,12 @@ class VisionTransformer:
 
 
 def _projection(layer: torch.nn.Module, facet: str) -> torch.nn.Module:
-    """The linear map of a layer's attention; `transformers` 4 and 5 call it differently."""
+    """A linear layer of a layer's attention; its name differs between `transformers` 4 and 5."""
     return next(module for name, module in layer.named_modules() if name.split(".")[-1] in PROJECTIONS[facet])
 
 
 class VitDescriptors:
-    """The paper's descriptors: a facet of one layer, gathered over log bins, with saliency from the class token."""
+    """The paper's descriptors: a facet of one layer over log bins, with saliency from the class token."""
 
     def __init__(self, checkpoint: VitCheckpoint, settings: DescriptorSettings):
         self.name = settings.model
