@@ -70,7 +70,7 @@ class EfficientNetDescriptors:
         finally:
             for hook in hooks:
                 hook.remove()
-        levels = []
+        levels: list[Float32Array] = []
         for stride in STRIDES:
             level = at_stride[stride][0].permute(1, 2, 0).contiguous().numpy()
             lengths = np.sqrt(np.einsum("rcd,rcd->rc", level, level))

@@ -15,6 +15,7 @@ from robust_instant_policy.perception.descriptors import DescriptorMap, Float32A
 from robust_instant_policy.pointcloud import in_metres, steady, table_plane
 
 MAX_EDGE_PX = 256  # larger images are subsampled: enough for millimetres, and fast
+UNBOUNDED = np.array([[-np.inf] * 3, [np.inf] * 3])  # metres
 MIN_STEADY_PIXELS = 100
 MIN_FOREGROUND_POINTS = 25
 MIN_HEIGHT_M = 0.010  # above the table, for points of objects,
@@ -36,18 +37,21 @@ COLOUR_SCALE_M = 0.06  # metres in an XYZRGB point for the difference between bl
 class Foreground:
     """``points (N, 3)`` in metres, world, and the same as ``xyzrgb (N, 6)`` in metres, colours in units of
     `COLOUR_SCALE_M`; ``cells (N,)`` of the descriptor map; ``segments``: the points' numbers, by connected component.
+    ``depth (H, W)`` of the whole image, metres; ``note`` tells if it was in another unit, or is empty.
     """
 
     points: FloatArray
     xyzrgb: Float32Array
     cells: IntArray
     segments: tuple[IntArray, ...]
+    depth: Float32Array
+    note: str
 
 
 def segment_foreground(
     observation: Observation, descriptors: DescriptorMap, salient: float, workspace: FloatArray | None, seed: int
-) -> tuple[Foreground, Float32Array, str]:
-    """Foreground and depth ``(H, W)`` in metres of an image, and a note if the depth was in another unit.
+) -> Foreground:
+    """Find the points of an image that do not belong to the table.
 
     A point is foreground by its height above the table, or, when flat, by the network's saliency (above ``salient``)
     and a colour that differs from the table's. Points outside ``workspace (2, 3)``, metres, world, are not foreground;
@@ -62,13 +66,13 @@ def segment_foreground(
     if len(pixels) < MIN_STEADY_PIXELS:
         raise KeypointError(f"only {len(pixels)} pixels have a steady depth; check the camera's depth stream")
     points = lift(pixels, depth[pixels[:, 1], pixels[:, 0]], observation.intrinsics, observation.camera_pose)
-    if workspace is not None:
-        inside = ((points >= workspace[0]) & (points <= workspace[1]))[:, :2].all(axis=1)
-        if inside.sum() < MIN_STEADY_PIXELS:
-            raise KeypointError(
-                f"only {inside.sum()} points of the image lie in the workspace; check it and the camera's pose"
-            )
-        points, pixels = points[inside], pixels[inside]
+    lower, upper = UNBOUNDED if workspace is None else workspace
+    inside = ((points >= lower) & (points <= upper))[:, :2].all(axis=1)
+    if inside.sum() < MIN_STEADY_PIXELS:
+        raise KeypointError(
+            f"only {inside.sum()} points of the image lie in the workspace; check it and the camera's pose"
+        )
+    points, pixels = points[inside], pixels[inside]
     cells = descriptors.cells_at(pixels)
     at = pixels[:, 1], pixels[:, 0]
     colours = np.divide(observation.rgb[at], 255, dtype=np.float32)
@@ -76,11 +80,9 @@ def segment_foreground(
     raised = _raised(points, seed)
     table = TableColour.fit(colours if raised.all() else colours[~raised])
     unlike_table = (table.distance(smoothed) > MIN_DISTANCE_SMOOTHED) & (table.distance(colours) > MIN_DISTANCE_POINT)
-    chosen = raised | (unlike_table & (descriptors.saliency.flat[cells] > salient))
-    if workspace is not None:
-        chosen &= points[:, 2] <= workspace[1][2]
-
-    kept = np.flatnonzero(chosen)
+    kept = np.flatnonzero(
+        (raised | (unlike_table & (descriptors.saliency.flat[cells] > salient))) & (points[:, 2] <= upper[2])
+    )
     place = tuple(pixels[kept, ::-1].T // stride)
     mask = np.zeros_like(usable)
     mask[place] = True
@@ -92,7 +94,7 @@ def segment_foreground(
         raise KeypointError("nothing stands out from the table in an image; is the object in the workspace?")
     xyzrgb = np.concatenate([points[kept], colours[kept] * COLOUR_SCALE_M], axis=1).astype(np.float32)
     segments = tuple(np.flatnonzero(labels == segment) for segment in np.unique(labels))
-    return Foreground(points[kept], xyzrgb, cells[kept], segments), depth, note
+    return Foreground(points[kept], xyzrgb, cells[kept], segments, depth, note)
 
 
 def _raised(points: FloatArray, seed: int) -> NDArray[np.bool_]:

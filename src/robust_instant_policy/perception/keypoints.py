@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -75,14 +75,21 @@ class KeypointExtractor:
         self.network_, note = choose_network(self.features, settings)
         self.descriptor_name_ = self.network_.name
         views = [make_view(observation, self.network_, self.workspace, self.seed) for observation in observations]
-        notes = [note, *dict.fromkeys(view.note for view in views if view.note)]
+        notes = [note, *dict.fromkeys(view.foreground.note for view in views if view.foreground.note)]
         if len(views) == 1:
             notes.append(
                 "one demonstration only: nothing to compare it with, so the keypoints are its most salient points"
             )
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
-        self.objects_ = _shared_objects(views, self.seed)
+        objects = find_objects(views, self.seed)
+        self.objects_ = [thing for thing in objects if thing.worst_fitness >= MIN_FITNESS]
+        if not self.objects_:
+            best = max((thing.worst_fitness for thing in objects), default=0.0)
+            raise KeypointError(
+                f"the images have nothing in common: the best object of the first has a fitness of {best:.2f} in the "
+                f"worst other image (needed: {MIN_FITNESS:.2f}); do all demonstrations show the same object?"
+            )
         if len(self.objects_) > self.num_keypoints:
             notes.append(
                 f"{len(self.objects_)} objects were found for {self.num_keypoints} keypoints; the largest have one each"
@@ -107,39 +114,24 @@ class KeypointExtractor:
         Raises `KeypointError` where depth or foreground are missing.
         """
         view = make_view(observation, self.network_, self.workspace, self.seed)
-        located = self._locate(view, [register(thing.templates, view) for thing in self.objects_])
-        return replace(located, notes=(view.note, *located.notes)) if view.note else located
+        return self._locate(view, [register(thing.templates, view) for thing in self.objects_])
 
     def _locate(self, view: View, registrations: Sequence[Registration]) -> Located:
         """The keypoints of objects with known ``registrations`` in ``view``."""
         triples = zip(self.objects_, self._places, registrations, strict=True)
         expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
-        points, pixels, measured = lift_to_surface(view.observation, view.depth, expected)
+        points, pixels, measured = lift_to_surface(view.observation, view.foreground.depth, expected)
         counts = [len(places) for places in self._places]
         confidence = np.repeat([(found.fitness + found.similarity) / 2 for found in registrations], counts)
         confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / RESIDUAL_M**2)
         confidence[~measured] /= 2
-        notes = [
-            f"keypoint {k} has no depth at its pixel; it is where its object says" for k in np.flatnonzero(~measured)
-        ]
+        notes = [view.foreground.note] if view.foreground.note else []
+        for k in np.flatnonzero(~measured):
+            notes.append(f"keypoint {k} has no depth at its pixel; it is where its object says")
         for number, found in enumerate(registrations):
             if found.fitness < MIN_FITNESS:
                 notes.append(f"object {number} was hardly recognised (fit {found.fitness:.2f})")
         return Located(points, pixels, np.clip(confidence, 0, 1), tuple(notes))
-
-
-def _shared_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
-    """The objects that all views show."""
-    objects = find_objects(views, seed)
-    worst = [min(registration.fitness for registration in thing.registrations) for thing in objects]
-    shared = [thing for thing, fitness in zip(objects, worst, strict=True) if fitness >= MIN_FITNESS]
-    if not shared:
-        raise KeypointError(
-            f"the images have nothing in common: the best object of the first has a fitness of "
-            f"{max(worst, default=0.0):.2f} in the worst other image (needed: {MIN_FITNESS:.2f}); "
-            "do all demonstrations show the same object?"
-        )
-    return shared
 
 
 def _expected_places(view: View, thing: RigidObject, places: FloatArray, found: Registration) -> FloatArray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 
-from robust_instant_policy.errors import MissingExtraError
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.settings import DescriptorSettings
 
@@ -36,14 +35,12 @@ def choose_network(features: str | DescriptorNetwork, settings: DescriptorSettin
     if features == "auto":
         where = f"the weights at {WEIGHTS_VARIABLE}={local}" if local else f"{source}, found in the hub's local cache"
         note = f"features: {where}"
-    try:
-        import torch  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("torch", "vision") from error
-    from robust_instant_policy.perception.vit import VitDescriptors
     from robust_instant_policy.perception.vit_checkpoint import load_checkpoint
 
-    return VitDescriptors(load_checkpoint(source), replace(settings, model=source)), note
+    checkpoint = load_checkpoint(source)  # before the import of torch: says which extra is missing
+    from robust_instant_policy.perception.vit import VitDescriptors
+
+    return VitDescriptors(checkpoint, replace(settings, model=source)), note
 
 
 def resolve_features(features: str, model: str = DescriptorSettings.model) -> str:
@@ -54,7 +51,4 @@ def resolve_features(features: str, model: str = DescriptorSettings.model) -> st
         return local
     from robust_instant_policy.perception.vit_checkpoint import cached_folder
 
-    try:
-        return model if cached_folder(model) is not None else "efficientnet"
-    except MissingExtraError:
-        return "efficientnet"
+    return model if cached_folder(model) else "efficientnet"

@@ -56,6 +56,10 @@ class RigidObject:
     templates: tuple[Template, ...]
     registrations: tuple[Registration, ...]
 
+    @property
+    def worst_fitness(self) -> float:
+        return min(registration.fitness for registration in self.registrations)
+
 
 def find_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
     """The segments of the first view, registered in all ``views``."""

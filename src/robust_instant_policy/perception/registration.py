@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robust_instant_policy.geometry import FloatArray, fit_upright, rotations_about_vertical, transform_points
-from robust_instant_policy.perception.descriptors import Float32Array
+from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 
 ANGLE_BINS = 24
 SHIFT_BIN_M = 0.015
@@ -116,32 +117,31 @@ def icp(
     linear = np.ascontiguousarray(-2 * target_xyz.T)
     costs = np.empty((len(motions), len(source), len(target)), dtype=np.float32)  # reused: allocation is slow
 
-    def match(motions: FloatArray) -> tuple[FloatArray, ...]:
-        """Nearest targets of the sources and nearest sources of the targets, and the squared distances of both."""
+    def match(motions: FloatArray) -> tuple[IntArray, IntArray, Float32Array, Float32Array, NDArray[np.bool_]]:
+        """Nearest targets of the sources, nearest sources of the targets, both squared distances, and which targets
+        are near enough to belong to the object.
+        """
         moved = (source_xyz @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]).astype(np.float32)
         np.matmul(moved, linear, out=costs)
         np.add(costs, constant, out=costs)
         np.add(costs, np.einsum("cnx,cnx->cn", moved, moved)[..., None], out=costs)
-        forward, backward = costs.argmin(axis=2), costs.argmin(axis=1)
-        forward_costs = np.take_along_axis(costs, forward[..., None], axis=2)[..., 0]
-        backward_costs = np.take_along_axis(costs, backward[:, None], axis=1)[:, 0]
-        return forward, backward, forward_costs, backward_costs
+        to_target, to_source = costs.min(axis=2), costs.min(axis=1)
+        return costs.argmin(axis=2), costs.argmin(axis=1), to_target, to_source, to_source < OWN_REACH_M**2
 
+    every_source, every_target = (
+        np.broadcast_to(points, (len(motions), *points.shape)) for points in (source_xyz, target_xyz)
+    )
     for reach in reaches:
-        forward, backward, forward_costs, backward_costs = match(motions)
-        own = backward_costs < OWN_REACH_M**2
-        weights = np.concatenate([np.exp(-forward_costs / reach**2), own * np.exp(-backward_costs / reach**2)], axis=1)
-        all_source = np.broadcast_to(source_xyz, (len(motions), *source_xyz.shape))
-        all_target = np.broadcast_to(target_xyz, (len(motions), *target_xyz.shape))
+        targets, sources, to_target, to_source, own = match(motions)
+        weights = np.concatenate([np.exp(-to_target / reach**2), own * np.exp(-to_source / reach**2)], axis=1)
         motions = fit_upright(
-            np.concatenate([all_source, source_xyz[backward]], axis=1),
-            np.concatenate([target_xyz[forward], all_target], axis=1),
+            np.concatenate([every_source, source_xyz[sources]], axis=1),
+            np.concatenate([target_xyz[targets], every_target], axis=1),
             weights + MIN_WEIGHT,
         )
-    _, _, forward_costs, backward_costs = match(motions)
-    own = backward_costs < OWN_REACH_M**2
-    covered = (own * np.exp(-backward_costs / RESIDUAL_M**2)).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
-    return motions, np.sqrt(np.exp(-forward_costs / RESIDUAL_M**2).mean(axis=1) * covered)
+    _, _, to_target, to_source, own = match(motions)
+    covered = (own * np.exp(-to_source / RESIDUAL_M**2)).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
+    return motions, np.sqrt(np.exp(-to_target / RESIDUAL_M**2).mean(axis=1) * covered)
 
 
 def colour_costs(source: Float32Array, target: Float32Array) -> Float32Array:

@@ -24,21 +24,18 @@ MAX_CENTRE_OFFSET = 0.4  # of the principal point from the image centre, of half
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """An ``observation`` with its ``descriptors``, ``depth (H, W)`` in metres and ``foreground``.
+    """An ``observation`` with its ``descriptors`` and ``foreground``.
 
     ``target (N, 6)`` are the XYZRGB points that objects are registered to. ``cells (C,)`` of the descriptor map: those
     with foreground, whose mean points are ``cell_points (F, 3)`` in metres, world, and then their neighbours.
-    ``note`` tells what was unusual, or is empty.
     """
 
     observation: Observation
     descriptors: DescriptorMap
-    depth: Float32Array
     foreground: Foreground
     target: Float32Array
     cells: IntArray
     cell_points: FloatArray
-    note: str
 
 
 def make_view(
@@ -53,7 +50,7 @@ def make_view(
             f"{width}x{height}; scale them to it"
         )
     descriptors = network.describe(observation.rgb)
-    foreground, depth, note = segment_foreground(observation, descriptors, network.salient, workspace, seed)
+    foreground = segment_foreground(observation, descriptors, network.salient, workspace, seed)
     cells, inverse, counts = np.unique(foreground.cells, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(inverse, foreground.points[:, axis]) for axis in range(3)], axis=1)
     kept = np.concatenate([subsample(segment, MAX_SEGMENT_POINTS, seed) for segment in foreground.segments])
@@ -61,12 +58,10 @@ def make_view(
     return View(
         observation,
         descriptors,
-        depth,
         foreground,
         foreground.xyzrgb[kept],
         np.concatenate([cells, neighbours]),
         sums / counts[:, None],
-        note,
     )
 
 

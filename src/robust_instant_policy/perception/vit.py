@@ -7,6 +7,7 @@ Descriptors are a facet of one layer, saliency the attention of the class token 
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,50 +26,72 @@ DINO_SALIENT_HEADS = (0, 2, 4, 5)  # of ViT-S's six; the reference averages thes
 PROJECTIONS = {"query": ("q_proj", "query"), "key": ("k_proj", "key"), "value": ("v_proj", "value")}
 
 
-class VisionTransformer:
-    """A frozen vision transformer whose patches may overlap.
+class VitDescriptors:
+    """The paper's descriptors: a facet of one layer over log bins, with saliency from the class token.
 
-    ``stride``, in pixels, must divide the patch size; position encodings are interpolated to the denser grid.
+    Raises `InvalidValueError` for ``settings`` with a stride, layer or facet that the model does not have.
     """
 
-    def __init__(self, model: Any, stride: int):
-        self.config = model.config
-        if stride < 1 or self.config.patch_size % stride:
-            raise InvalidValueError(f"stride {stride} must divide the patch size {self.config.patch_size}")
-        self._model, self._stride = model, stride
+    def __init__(self, checkpoint: VitCheckpoint, settings: DescriptorSettings):
+        self._model, self.config = checkpoint.model, checkpoint.model.config
         self._layers = [
-            module for name, module in model.named_modules() if name.split(".")[-2:-1] in (["layers"], ["layer"])
+            module for name, module in self._model.named_modules() if name.split(".")[-2:-1] in (["layers"], ["layer"])
         ]
+        if settings.stride < 1 or self.config.patch_size % settings.stride:
+            raise InvalidValueError(f"stride {settings.stride} must divide the patch size {self.config.patch_size}")
+        if not 0 <= settings.layer < len(self._layers):
+            raise InvalidValueError(f"layer must be 0 to {len(self._layers) - 1}, got {settings.layer}")
+        if settings.facet not in FACETS:
+            raise InvalidValueError(f"facet must be one of {', '.join(FACETS)}, got {settings.facet!r}")
+        self.name = settings.model
+        self.salient = settings.saliency_threshold
+        self._settings = settings
+        self._mean = np.array(checkpoint.mean, dtype=np.float32)
+        self._deviation = np.array(checkpoint.deviation, dtype=np.float32)
+
+    def describe(self, rgb: NDArray[np.uint8]) -> DescriptorMap:
+        batch = self.prepare(rgb)
+        features, saliency = self.features(batch)
+        scale = np.array([rgb.shape[1] / batch.shape[3], rgb.shape[0] / batch.shape[2]])
+        return DescriptorMap(
+            features.numpy(),
+            saliency.numpy(),
+            origin=self.config.patch_size / 2 * scale - 0.5,
+            step=self._settings.stride * scale,
+            log_bins=self._settings.log_bins,
+        )
+
+    def prepare(self, rgb: NDArray[np.uint8]) -> torch.Tensor:
+        """The normalised image ``(1, 3, h, w)``, its shorter edge `DescriptorSettings.load_size` (Lanczos)."""
+        height, width = rgb.shape[:2]
+        shorter, size = min(height, width), self._settings.load_size
+        loaded = Image.fromarray(rgb).resize(
+            (size * width // shorter, size * height // shorter), Image.Resampling.LANCZOS
+        )
+        pixels = (np.asarray(loaded, dtype=np.float32) / 255 - self._mean) / self._deviation
+        return torch.from_numpy(pixels).permute(2, 0, 1)[None]
 
     @torch.inference_mode()
-    def features(self, batch: torch.Tensor, layer: int, facet: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Descriptors ``(rows, cols, D)``, a facet of a layer, and saliency ``(rows, cols)`` in [0, 1].
-
-        ``batch (1, 3, H, W)`` is one normalised image. Raises `InvalidValueError` for unknown layers and facets.
-        """
-        if not 0 <= layer < len(self._layers):
-            raise InvalidValueError(f"layer must be 0 to {len(self._layers) - 1}, got {layer}")
-        if facet not in FACETS:
-            raise InvalidValueError(f"facet must be one of {', '.join(FACETS)}, got {facet!r}")
+    def features(self, batch: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Descriptors ``(rows, cols, D)`` and saliency ``(rows, cols)`` in [0, 1] of one image, ``(1, 3, h, w)``."""
+        stride, facet = self._settings.stride, self._settings.facet
+        chosen, last = self._layers[self._settings.layer], self._layers[-1]
+        wanted = {
+            "descriptors": chosen if facet == "token" else _projection(chosen, facet),
+            "query": _projection(last, "query"),
+            "key": _projection(last, "key"),
+        }
         seen: dict[str, torch.Tensor] = {}
 
-        def keep(name: str, module: torch.nn.Module) -> torch.utils.hooks.RemovableHandle:
-            def hook(_module: Any, _inputs: Any, output: Any) -> None:
-                seen[name] = output[0] if isinstance(output, tuple) else output
+        def keep(name: str, _module: Any, _inputs: Any, output: Any) -> None:
+            seen[name] = output[0] if isinstance(output, tuple) else output
 
-            return module.register_forward_hook(hook)
-
-        chosen, last = self._layers[layer], self._layers[-1]
-        hooks = [
-            keep("wanted", chosen if facet == "token" else _projection(chosen, facet)),
-            keep("query", _projection(last, "query")),
-            keep("key", _projection(last, "key")),
-        ]
+        hooks = [module.register_forward_hook(partial(keep, name)) for name, module in wanted.items()]
         embeddings = self._model.embeddings
         convolution = embeddings.patch_embeddings.projection
-        grid = tuple((edge - self.config.patch_size) // self._stride + 1 for edge in batch.shape[2:])
+        grid = tuple((edge - self.config.patch_size) // stride + 1 for edge in batch.shape[2:])
         before = convolution.stride, embeddings.interpolate_pos_encoding
-        convolution.stride = (self._stride, self._stride)
+        convolution.stride = (stride, stride)
         embeddings.interpolate_pos_encoding = lambda *_: self.positions(*grid)
         try:
             self._model(batch, **({"interpolate_pos_encoding": True} if self.config.model_type == "vit" else {}))
@@ -79,14 +102,16 @@ class VisionTransformer:
         special = 1 + getattr(self.config, "num_register_tokens", 0)
         heads = self.config.num_attention_heads
         query, key = (seen[name].unflatten(2, (heads, -1)).transpose(1, 2) for name in ("query", "key"))
+        # Only the class token's row of the attention.
         attention = torch.softmax(query[:, :, :1] @ key.transpose(2, 3) / math.sqrt(key.shape[3]), dim=3)
         salient = DINO_SALIENT_HEADS if heads == 6 else range(heads)
         saliency = attention[0, list(salient), 0, special:].mean(dim=0)
         saliency = (saliency - saliency.min()) / (saliency.max() - saliency.min()).clamp_min(1e-12)
-        wanted = seen["wanted"]
+        descriptors = seen["descriptors"]
         if facet != "token":
-            wanted = wanted.unflatten(2, (heads, -1)).transpose(2, 3).flatten(2)  # heads innermost, as the reference
-        return wanted[0, special:].reshape(*grid, -1), saliency.reshape(grid)
+            # The reference's order: heads innermost.
+            descriptors = descriptors.unflatten(2, (heads, -1)).transpose(2, 3).flatten(2)
+        return descriptors[0, special:].reshape(*grid, -1), saliency.reshape(grid)
 
     def positions(self, rows: int, cols: int) -> torch.Tensor:
         """Position encodings ``(1, 1 + rows · cols, D)``, interpolated from the trained grid."""
@@ -108,38 +133,3 @@ class VisionTransformer:
 def _projection(layer: torch.nn.Module, facet: str) -> torch.nn.Module:
     """A linear layer of a layer's attention; its name differs between `transformers` 4 and 5."""
     return next(module for name, module in layer.named_modules() if name.split(".")[-1] in PROJECTIONS[facet])
-
-
-class VitDescriptors:
-    """The paper's descriptors: a facet of one layer over log bins, with saliency from the class token."""
-
-    def __init__(self, checkpoint: VitCheckpoint, settings: DescriptorSettings):
-        self.name = settings.model
-        self.salient = settings.saliency_threshold
-        self._settings = settings
-        self._network = VisionTransformer(checkpoint.model, settings.stride)
-        self._mean = np.array(checkpoint.mean, dtype=np.float32)
-        self._deviation = np.array(checkpoint.deviation, dtype=np.float32)
-
-    def prepare(self, rgb: NDArray[np.uint8]) -> torch.Tensor:
-        """The normalised image ``(1, 3, h, w)``, its shorter edge `DescriptorSettings.load_size` (Lanczos)."""
-        height, width = rgb.shape[:2]
-        shorter, size = min(height, width), self._settings.load_size
-        loaded = Image.fromarray(rgb).resize(
-            (size * width // shorter, size * height // shorter), Image.Resampling.LANCZOS
-        )
-        pixels = (np.asarray(loaded, dtype=np.float32) / 255 - self._mean) / self._deviation
-        return torch.from_numpy(pixels).permute(2, 0, 1)[None]
-
-    def describe(self, rgb: NDArray[np.uint8]) -> DescriptorMap:
-        settings, patch = self._settings, self._network.config.patch_size
-        batch = self.prepare(rgb)
-        features, saliency = self._network.features(batch, settings.layer, settings.facet)
-        shrink = np.array([rgb.shape[1] / batch.shape[3], rgb.shape[0] / batch.shape[2]])
-        return DescriptorMap(
-            features.numpy(),
-            saliency.numpy(),
-            origin=patch / 2 * shrink - 0.5,
-            step=settings.stride * shrink,
-            log_bins=settings.log_bins,
-        )

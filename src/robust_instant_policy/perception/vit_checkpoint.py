@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,8 +32,11 @@ def load_checkpoint(source: str) -> VitCheckpoint:
     """The model at ``source``: a folder, a ``.safetensors`` file, or a name on the hub (``owner/model``).
 
     A name may end in ``@revision``, a commit of the hub's repository. The local cache goes before the hub; without a
-    connection the error comes within seconds. Raises `ModelError`, one line.
+    connection the error comes within seconds. Raises `ModelError`, one line, and `MissingExtraError`.
     """
+    for package in ("torch", "transformers", "safetensors"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingExtraError(package, "vision")
     path = Path(source).expanduser()
     if path.is_dir():
         return _from_folder(path)
@@ -47,14 +51,12 @@ def cached_folder(name: str) -> Path | None:
     """The folder with the weights of ``name`` in the hub's local cache, without a request to the hub."""
     try:
         from huggingface_hub import try_to_load_from_cache
-    except ImportError as error:
-        raise MissingExtraError("transformers", "vision") from error
+    except ImportError:
+        return None
     repository, _, revision = name.partition("@")
-    for file in WEIGHT_FILES:
-        found = try_to_load_from_cache(repository, file, revision=revision or None)
-        if isinstance(found, str) and (Path(found).parent / "config.json").exists():
-            return Path(found).parent
-    return None
+    paths = (try_to_load_from_cache(repository, file, revision=revision or None) for file in WEIGHT_FILES)
+    folders = (Path(path).parent for path in paths if isinstance(path, str))
+    return next((folder for folder in folders if (folder / "config.json").exists()), None)
 
 
 def _download(name: str) -> Path:
@@ -103,12 +105,10 @@ def _from_file(path: Path) -> VitCheckpoint:
     """A model whose configuration is derived from the names and shapes of its tensors."""
     if path.suffix != ".safetensors":
         raise ModelError(f"{path} is not a .safetensors file; give one, or a folder that transformers saved")
-    try:
-        import transformers
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-    except ImportError as error:
-        raise MissingExtraError(error.name or "transformers", "vision") from error
+    import transformers
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
     try:
         tensors = load_file(path)
     except (SafetensorError, OSError) as error:
@@ -141,11 +141,9 @@ def _from_file(path: Path) -> VitCheckpoint:
 
 def _load(path: Path, config: Any = None, tensors: dict[str, Any] | None = None) -> Any:
     """The frozen model. Raises `ModelError` with the names of tensors that are missing or of another shape."""
-    try:
-        import torch
-        import transformers
-    except ImportError as error:
-        raise MissingExtraError(error.name or "transformers", "vision") from error
+    import torch
+    import transformers
+
     level = transformers.logging.get_verbosity()
     transformers.logging.set_verbosity_error()  # what it would warn of is an error below
     bars = transformers.utils.logging.is_progress_bar_enabled()
