@@ -3,7 +3,9 @@
 import json
 import math
 import shutil
+import threading
 import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
@@ -181,8 +183,9 @@ def test_the_papers_settings_give_the_papers_grids(vit_folder, settings, shape, 
         np.random.default_rng(0).integers(0, 255, (*shape, 3), dtype=np.uint8)
     )
     assert described.grid == grid
-    np.testing.assert_allclose(described.pixels[0], (3.5, 3.5))
-    np.testing.assert_allclose(described.pixels[-1], np.array(shape[::-1]) - 4.5, atol=settings.stride)
+    np.testing.assert_allclose(described.origin, 3.5)
+    last = described.origin + described.step * (np.array(grid[::-1]) - 1)
+    np.testing.assert_allclose(last, np.array(shape[::-1]) - 4.5, atol=settings.stride)
     assert described.saliency.min() == 0
     assert described.saliency.max() == 1
 
@@ -267,6 +270,51 @@ def test_a_broken_file_is_told_in_one_line(tmp_path):
     with pytest.raises(ModelError, match="cannot be read as weights") as error:
         load_checkpoint(str(tmp_path))
     assert "\n" not in str(error.value)
+
+
+def test_weights_come_from_the_hub_and_then_from_its_cache(vit_folder, monkeypatch, tmp_path):
+    commit, files = "c" * 40, {file.name: file.read_bytes() for file in vit_folder.iterdir()}
+
+    class Hub(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            name = self.path.rsplit("/", 1)[1]
+            if "/tree/" in self.path:
+                body = json.dumps(
+                    [{"type": "file", "path": file, "size": len(files[file]), "oid": "0" * 40} for file in files]
+                ).encode()
+            elif self.path.startswith("/api/"):
+                siblings = [{"rfilename": file} for file in files]
+                body = json.dumps({"id": "some/vit", "sha": commit, "siblings": siblings}).encode()
+            else:
+                body = files[name]
+            self.send_response(200)
+            self.send_header("ETag", f'"{name}"')
+            self.send_header("X-Repo-Commit", commit)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            if self.command == "GET":
+                self.wfile.write(body)
+
+        do_HEAD = do_GET
+
+        def log_message(self, *_: object) -> None: ...
+
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with ThreadingHTTPServer(("127.0.0.1", 0), Hub) as server:
+        address = f"http://127.0.0.1:{server.server_port}"
+        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", address)
+        monkeypatch.setattr(
+            "huggingface_hub.constants.HUGGINGFACE_CO_URL_TEMPLATE",
+            address + "/{repo_id}/resolve/{revision}/{filename}",
+        )
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        fetched = load_checkpoint("some/vit").model.state_dict()
+        server.shutdown()
+    cached = load_checkpoint("some/vit").model.state_dict()
+    expected = load_checkpoint(str(vit_folder)).model.state_dict()
+    assert all(
+        torch.equal(fetched[name], tensor) and torch.equal(cached[name], tensor) for name, tensor in expected.items()
+    )
 
 
 def test_without_a_connection_the_hub_is_given_up_within_seconds(monkeypatch, tmp_path):

@@ -69,12 +69,6 @@ class DescriptorMap:
         total = sum(squares[level][self.shifted(cells, row, col)] for level, row, col in self.bins)
         return np.sqrt(np.maximum(total, TINY))
 
-    @cached_property
-    def pixels(self) -> FloatArray:
-        """Patch centres ``(rows · cols, 2)``, (u, v) in the original image."""
-        rows, cols = np.indices(self.grid).reshape(2, -1)
-        return self.origin + self.step * np.stack([cols, rows], axis=1)
-
     def cells_at(self, pixels: ArrayLike) -> IntArray:
         """The cells ``(...)`` nearest to ``pixels (..., 2)``."""
         rows, cols = self.grid

@@ -80,9 +80,8 @@ def segment_foreground(
     raised = _raised(points, seed)
     table = TableColour.fit(colours if raised.all() else colours[~raised])
     unlike_table = (table.distance(smoothed) > MIN_DISTANCE_SMOOTHED) & (table.distance(colours) > MIN_DISTANCE_POINT)
-    kept = np.flatnonzero(
-        (raised | (unlike_table & (descriptors.saliency.flat[cells] > salient))) & (points[:, 2] <= upper[2])
-    )
+    flat_object = unlike_table & (descriptors.saliency.flat[cells] > salient)
+    kept = np.flatnonzero((raised | flat_object) & (points[:, 2] <= upper[2]))
     place = tuple(pixels[kept, ::-1].T // stride)
     mask = np.zeros_like(usable)
     mask[place] = True

@@ -41,7 +41,10 @@ class View:
 def make_view(
     observation: Observation, network: DescriptorNetwork, workspace: FloatArray | None = None, seed: int = 0
 ) -> View:
-    """Raises `KeypointError` for intrinsics of another resolution, and where depth or foreground are missing."""
+    """Describe and segment an image. For ``workspace`` and ``seed`` see `KeypointExtractor`.
+
+    Raises `KeypointError` for intrinsics of another resolution, and where depth or foreground are missing.
+    """
     height, width = observation.depth.shape
     cx, cy = observation.intrinsics[:2, 2]
     if not (abs(cx / (width / 2) - 1) < MAX_CENTRE_OFFSET and abs(cy / (height / 2) - 1) < MAX_CENTRE_OFFSET):
@@ -55,14 +58,8 @@ def make_view(
     sums = np.stack([np.bincount(inverse, foreground.points[:, axis]) for axis in range(3)], axis=1)
     kept = np.concatenate([subsample(segment, MAX_SEGMENT_POINTS, seed) for segment in foreground.segments])
     neighbours = np.setdiff1d([descriptors.shifted(cells, row, col) for row, col in NEIGHBOURS], cells)
-    return View(
-        observation,
-        descriptors,
-        foreground,
-        foreground.xyzrgb[kept],
-        np.concatenate([cells, neighbours]),
-        sums / counts[:, None],
-    )
+    with_neighbours, cell_points = np.concatenate([cells, neighbours]), sums / counts[:, None]
+    return View(observation, descriptors, foreground, foreground.xyzrgb[kept], with_neighbours, cell_points)
 
 
 def subsample(indices: IntArray, count: int, seed: int) -> IntArray:

@@ -76,7 +76,7 @@ def _download(name: str) -> Path:
         raise ModelError(f"the hub refuses {name}: {excerpt(error)}") from error
     except Exception as error:  # whose type depends on the hub's client
         raise ModelError(
-            f"the weights of {name} are not in the local cache and the hub cannot be reached ({excerpt(error)}); "
+            f"the weights of {name} are not in the local cache and the hub cannot provide them ({excerpt(error)}); "
             "copy them here and pass the folder, or use features='efficientnet'"
         ) from error
 
@@ -172,11 +172,12 @@ def _load(path: Path, config: Any = None, tensors: dict[str, Any] | None = None)
         if bars:
             transformers.utils.logging.enable_progress_bar()
     wrong = [f"{name} is missing" for name in sorted(report["missing_keys"])]
-    for key in report["mismatched_keys"]:  # names in transformers 4, with shapes in 5
-        if isinstance(key, str):
-            wrong.append(f"{key} has another shape")
-        else:
-            wrong.append(f"{key[0]} is {tuple(key[1])} instead of {tuple(key[2])}")
+    wrong += [  # names in transformers 4, with shapes in 5
+        f"{key} has another shape"
+        if isinstance(key, str)
+        else f"{key[0]} is {tuple(key[1])} instead of {tuple(key[2])}"
+        for key in report["mismatched_keys"]
+    ]
     if wrong:
         more = f" and {len(wrong) - MAX_LISTED_TENSORS} more" if len(wrong) > MAX_LISTED_TENSORS else ""
         raise ModelError(f"the checkpoint {path} does not fit: {'; '.join(wrong[:MAX_LISTED_TENSORS])}{more}")
