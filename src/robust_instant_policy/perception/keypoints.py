@@ -75,7 +75,7 @@ class KeypointExtractor:
         self.network_, note = choose_network(self.features, settings)
         self.descriptor_name_ = self.network_.name
         views = [make_view(observation, self.network_, self.workspace, self.seed) for observation in observations]
-        notes = [note, *dict.fromkeys(view.foreground.note for view in views if view.foreground.note)]
+        notes = [note, *dict.fromkeys(view.note for view in views if view.note)]
         if len(views) == 1:
             notes.append(
                 "one demonstration only: nothing to compare it with, so the keypoints are its most salient points"
@@ -120,12 +120,12 @@ class KeypointExtractor:
         """The keypoints of objects with known ``registrations`` in ``view``."""
         triples = zip(self.objects_, self._places, registrations, strict=True)
         expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
-        points, pixels, measured = lift_to_surface(view.observation, view.foreground.depth, expected)
+        points, pixels, measured = lift_to_surface(view.observation, view.depth, expected)
         counts = [len(places) for places in self._places]
         confidence = np.repeat([(found.fitness + found.similarity) / 2 for found in registrations], counts)
         confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / RESIDUAL_M**2)
         confidence[~measured] /= 2
-        notes = [view.foreground.note] if view.foreground.note else []
+        notes = [view.note] if view.note else []
         for k in np.flatnonzero(~measured):
             notes.append(f"keypoint {k} has no depth at its pixel; it is where its object says")
         for number, found in enumerate(registrations):

@@ -10,9 +10,8 @@ from scipy.spatial import cKDTree
 
 from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
-from robust_instant_policy.perception.foreground import MIN_FOREGROUND_POINTS
 from robust_instant_policy.perception.registration import refine, vote_for_motions
-from robust_instant_policy.perception.view import View, subsample
+from robust_instant_policy.perception.view import MIN_FOREGROUND_POINTS, View, subsample
 
 MAX_TEMPLATE_POINTS = 250
 MAX_TEMPLATE_CELLS = 80
@@ -37,7 +36,7 @@ IN_REFERENCE = Registration(np.eye(4), 1.0, 1.0, 0)
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """An object in one image, in the reference image's frame: ``xyzrgb (N, 6)`` in metres (see `Foreground`), and the
+    """An object in one image, in the reference image's frame: ``xyzrgb (N, 6)`` in metres (see `View`), and the
     ``view``'s ``cells (M,)`` with their ``points (M, 3)``.
     """
 
@@ -63,10 +62,10 @@ class RigidObject:
 
 def find_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
     """The segments of the first view, registered in all ``views``."""
-    foreground = views[0].foreground
+    first = views[0]
     return [
-        _model(views, foreground.xyzrgb[subsample(segment, MAX_TEMPLATE_POINTS, seed)], seed)
-        for segment in foreground.segments
+        _model(views, first.xyzrgb[subsample(segment, MAX_TEMPLATE_POINTS, seed)], seed)
+        for segment in first.segments
         if len(segment) >= MIN_FOREGROUND_POINTS
     ]
 

@@ -33,8 +33,8 @@ def select_points(thing: RigidObject, views: Sequence[View], count: int, seed: i
     has_depth = np.ones(len(points), dtype=bool)
     for view, registration in zip(views, thing.registrations, strict=True):
         expected = transform_points(registration.pose, points)
-        seen += cKDTree(view.foreground.points).query(expected)[0] < SEEN_M
-        has_depth &= lift_to_surface(view.observation, view.foreground.depth, expected)[2]
+        seen += cKDTree(view.points).query(expected)[0] < SEEN_M
+        has_depth &= lift_to_surface(view.observation, view.depth, expected)[2]
     score = seen / len(views) + _mutual_matches(thing, views, points)
     score += home.descriptors.saliency.flat[home.descriptors.cells_at(pixels)]
 
@@ -68,7 +68,7 @@ def _mutual_matches(thing: RigidObject, views: Sequence[View], points: FloatArra
         return np.ones(len(points))
     home = views[0]
     cells = home.cells[: len(home.cell_points)]
-    patch_m = home.descriptors.step.mean() * np.nanmedian(home.foreground.depth) / home.observation.intrinsics[0, 0]
+    patch_m = home.descriptors.step.mean() * np.nanmedian(home.depth) / home.observation.intrinsics[0, 0]
     reach = MATCH_REACH_PATCHES * patch_m
     votes = np.zeros(len(cells))
     for view, registration in zip(views[1:], thing.registrations[1:], strict=True):
