@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from robust_instant_policy import Trajectory
 from robust_instant_policy.errors import InvalidValueError
-from robust_instant_policy.geometry import GripperTriangle, fit_rigid, interpolate_poses, lift, make_pose, project
+from robust_instant_policy.geometry import GripperTriangle, fit_rigid, lift, make_pose, project
 from robust_instant_policy.trajectory import STATE_INDEX, downsample, masked_steps, uniform_steps
 
 TRIANGLE = GripperTriangle(length=0.12, opening=0.05)
@@ -54,13 +54,6 @@ def test_pixels_lift_to_the_points_they_were_projected_from():
     local = np.random.default_rng(1).uniform([-0.3, -0.3, 0.5], [0.3, 0.3, 1.5], (40, 3))
     world = local @ camera[:3, :3].T + camera[:3, 3]
     np.testing.assert_allclose(lift(project(world, intrinsics, camera), local[:, 2], intrinsics, camera), world)
-
-
-def test_poses_between_two_waypoints_turn_on_the_shortest_arc():
-    start, stop = make_pose(np.eye(3), [0, 0, 0]), make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0, 0, 1])
-    middle = interpolate_poses([0, 1], [start, stop], [0.5])[0]
-    np.testing.assert_allclose(middle[:3, 3], [0, 0, 0.5])
-    np.testing.assert_allclose(middle[:2, 0], [np.sqrt(0.5), np.sqrt(0.5)])
 
 
 @given(

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from robust_instant_policy.errors import InvalidValueError
 
@@ -107,23 +106,6 @@ def fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) -> 
     motion[..., :3, 3] = target_mean - (rotation @ source_mean[..., None])[..., 0]
     motion[..., 3, 3] = 1.0
     return motion
-
-
-def interpolate_poses(times: ArrayLike, poses: ArrayLike, at: ArrayLike) -> FloatArray:
-    """Poses ``(M, 4, 4)`` at times ``at (M,)``: positions linear, rotations on the shortest arc.
-
-    ``times (N,)`` must increase; times outside are clamped to the ends.
-    """
-    times = np.asarray(times, dtype=np.float64)
-    poses = np.asarray(poses, dtype=np.float64)
-    at = np.clip(np.asarray(at, dtype=np.float64), times[0], times[-1])
-    if len(times) == 1:
-        return np.repeat(poses, len(at), axis=0)
-    result = np.tile(np.eye(4), (len(at), 1, 1))
-    result[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
-    for axis in range(3):
-        result[:, axis, 3] = np.interp(at, times, poses[:, axis, 3])
-    return result
 
 
 def project(points: ArrayLike, intrinsics: ArrayLike, camera_pose: ArrayLike) -> FloatArray:
