@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey
 from robust_instant_policy.evaluation.failures import Failure
@@ -91,7 +90,5 @@ class SceneWork:
         return replace(self, done=frozenset(done), failed=tuple(failed.values()), plans=plans)
 
 
-class Workers(Protocol):
-    """Workers, on this machine or many: they do scenes in any order, each as soon as one of them is free."""
-
-    def __call__(self, setup: Setup, works: list[SceneWork]) -> Iterator[Outcome]: ...
+# Workers, on this machine or many: they do scenes in any order, each as soon as one of them is free.
+Workers = Callable[[Setup, list[SceneWork]], Iterator[Outcome]]
