@@ -237,7 +237,7 @@ def write_speed() -> None:
     """The table from what is kept; ends the command with an error where a line needs too much memory."""
     rows = [
         "| features | column | bare pass | 10 demonstrations / 10 passes | new observation / pass "
-        "| describe, see, follow | peak memory | reference, one image |",
+        "| describe, segment, match | peak memory | reference, one image |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     greedy = []
