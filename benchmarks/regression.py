@@ -388,8 +388,8 @@ def main() -> None:
 PAGE_TEMPLATE = """# Regression, measured
 
 Written by `python benchmarks/regression.py` in {minutes:.1f} minutes on the machine it last ran on, from {scenes}
-scenes, with more scenes for the later tables. The scenes are those of `benchmarks/contaminated_trajectories.py`: gripper
-triplets, candidates with noise per number, per step and slowly varying along the candidate (a point of a clean
+scenes, with more scenes for the later tables. The scenes are those of `benchmarks/contaminated_trajectories.py`:
+gripper triplets, candidates with noise per number, per step and slowly varying along the candidate (a point of a clean
 candidate is {noise[0]:.1f} mm from the truth in the median scene, {noise[1]:.1f} and {noise[2]:.1f} mm in the tenth
 with least and most noise), rounded to millimetres. In a quarter of the scenes the candidates have different lengths. A
 hallucination moves at least one point by 15 mm or more.

@@ -1,4 +1,4 @@
-"""The five tasks of the ALOHA cell, behind the contract of `tasks.task.Task`."""
+"""The five tasks of the ALOHA cell as `tasks.task.Task`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TIMING = Timing(control_hz=CONTROL_HZ, record_every=5, frame_every=10, execute_h
 
 
 class CellTask(SimulatedTask):
-    """A task of one arm or both; ``objects`` as in `tasks.make_task`, and there is one source of ``assets``."""
+    """A task of one arm or both; ``objects`` as in `tasks.make_task`, with one source of ``assets``."""
 
     def __init__(self, spec: TaskSpec, objects: str, assets: str):
         env = gymnasium.make(spec.env_id, objects=objects, obs_mode="none")
