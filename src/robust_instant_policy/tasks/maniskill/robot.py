@@ -135,7 +135,7 @@ class UR5eHandE(BaseAgent):
             drive.set_drive_target(target)
 
     def is_grasping(self, object: Actor | Link, min_force: float = 0.5, max_angle: float = 85.0) -> torch.Tensor:
-        """Whether both fingers press on ``object`` with at least ``min_force`` N, roughly along the closing direction."""
+        """Whether both fingers press on ``object`` with ``min_force`` N or more, about along the closing direction."""
         pressed = []
         for finger, outward in ((self.left_finger, 1.0), (self.right_finger, -1.0)):
             force = self.scene.get_pairwise_contact_forces(finger, object)
