@@ -6,8 +6,9 @@
     python benchmarks/confidence.py report runs/confidence               # table and diagram from the others
 
 A row is what a user would see: refused while fitting or planning, or a plan with its confidence and whether it succeeds
-in the simulator. Faults are those of `benchmarks/faults.py`. Plans are made with `stand_in.StandIn`, no language model:
-its answers agree (``--spread 0``) or are drawn from bootstraps of the prompt's examples (``--spread 1``).
+in the simulator. Faults are those of `benchmarks/faults.py`, and models that hallucinate. Plans are made with
+`stand_in.StandIn`, no language model: its answers agree (``--spread 0``) or are drawn from bootstraps of the prompt's
+examples (``--spread 1``).
 
 Demonstrations and scenes of the two splits share no seed: "tune" is for `fit`, "test" for `report`.
 """
@@ -43,6 +44,7 @@ from robust_instant_policy.tasks.record import record
 
 TABLES = Path(__file__).parent.parent / "docs" / "tables"
 SPLITS = {"tune": (700_000, 710_000), "test": (720_000, 730_000)}  # first seeds of demonstrations and of new scenes
+HALLUCINATED = {"hallucinated-40%": 0.4, "hallucinated-60%": 0.6, "hallucinated-80%": 0.8}  # of the candidates
 NUM_DEMOS = 10
 GATE = 0.9
 NAMES = [field.name for field in fields(Evidence)]
@@ -65,7 +67,7 @@ def keep(rows: Path, row: Row) -> None:
 
 def cases(options: argparse.Namespace) -> list[tuple[str, str, str]]:
     """(split, fault, camera) in an order that covers every fault early."""
-    names = options.faults or ["none", *FAULTS]
+    names = options.faults or ["none", *FAULTS, *HALLUCINATED]
     found = [(split, name, camera) for name in names for split in options.splits for camera in options.cameras]
     if options.share < 1:  # the same part of the faults for the same task, whatever else is asked for
         found = [case for case in found if case[1] == "none" or zlib.crc32(repr(case).encode()) / 2**32 < options.share]
@@ -108,7 +110,7 @@ def examine(
         return observation if noise is None else noise.photograph(observation, seed)
 
     base: Row = {"task": task.name, "split": split, "fault": name, "camera": camera, "spread": spread}
-    policy = RobustInstantPolicy(StandIn(spread), workspace=task.workspace)
+    policy = RobustInstantPolicy(StandIn(spread, HALLUCINATED.get(name, 0.0)), workspace=task.workspace)
     seen = [replace(d, observation=photograph(d.observation, i)) for i, d in enumerate(shown)]
     try:
         policy.fit(seen if fault.demonstrations is None else fault.demonstrations(seen))

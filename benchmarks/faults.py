@@ -312,6 +312,46 @@ def tasks_mixed(ds: Sequence[Demonstration]) -> Demonstrations:
     return [replace(d, task="another") if i >= len(ds) // 2 else d for i, d in enumerate(ds)]
 
 
+def scattered(sigma: float) -> Callable[[Sequence[Demonstration]], Demonstrations]:
+    """Each path displaced on the table by its own error: a camera that is loose, or calibrated anew each time."""
+
+    def apply(ds: Sequence[Demonstration]) -> Demonstrations:
+        rng = np.random.default_rng(SEED)
+        offsets = rng.normal(0, sigma, (len(ds), 2))
+        return [points(lambda p, by=(x, y, 0.0): p + by)([d])[0] for d, (x, y) in zip(ds, offsets, strict=True)]
+
+    return apply
+
+
+def first(count: int) -> Callable[[Sequence[Demonstration]], Demonstrations]:
+    return lambda ds: list(ds[:count])
+
+
+def neighbouring(count: int) -> Callable[[Sequence[Demonstration]], Demonstrations]:
+    """The demonstrations that begin their work nearest to the first one's: a corner of the table."""
+
+    def apply(ds: Sequence[Demonstration]) -> Demonstrations:
+        low = np.stack(
+            [tips[tips[:, 2].argmin()] for tips in (d.trajectory.triplets[:, 0, 1:].mean(axis=1) for d in ds)]
+        )
+        return [ds[i] for i in np.argsort(np.linalg.norm(low - low[0], axis=1), kind="stable")[:count]]
+
+    return apply
+
+
+def half_hidden(o: Observation) -> Observation:
+    """The left half of what stands above the table is covered by something that looks like the table."""
+    table = float(np.median(o.depth[o.depth > 0]))
+    raised = (o.depth > 0) & (o.depth < table - 0.015)
+    if not raised.any():
+        return o
+    columns = np.flatnonzero(raised.any(axis=0))
+    hidden = raised & (np.arange(o.depth.shape[1]) < np.median(columns))
+    rgb, depth = o.rgb.copy(), o.depth.copy()
+    rgb[hidden], depth[hidden] = np.median(o.rgb.reshape(-1, 3), axis=0), table
+    return replace(o, rgb=rgb, depth=depth)
+
+
 # Faults of a plan.
 
 
@@ -456,6 +496,12 @@ def _faults() -> dict[str, Fault]:
     add("one-scene:demos", ("one scene", "same"), demonstrations=same_scene)
     add("duplicates:demos", ("same", "duplicate"), demonstrations=duplicates)
     add("tasks-mixed:demos", ("task",), demonstrations=tasks_mixed)
+    for centimetres in (1, 2, 4):
+        add(f"scattered-{centimetres}cm:demos", ("contradict", "repeat"), demonstrations=scattered(centimetres / 100))
+    for count in (1, 2, 3):
+        add(f"first-{count}:demos", (), demonstrations=first(count))
+    add("neighbouring-4:demos", ("outside",), demonstrations=neighbouring(4))
+    add("half-hidden:scene", ("recognised",), scene=lambda o, _: half_hidden(o))
     add("jump-0.8m:plan", ("step", "m from"), plan=plan_points(jump(0.8)))
     add("jump-0.3m:plan", ("step", "m from"), plan=plan_points(jump(0.3)))
     add("turn-179:plan", ("turn",), plan=plan_points(spin(179.0)))

@@ -235,7 +235,7 @@ def check_import(python: Path, scratch: Path) -> str:
 
 def table(rows: list[dict[str, object]], folder: str) -> str:
     lines = [
-        f"Written by `benchmarks/lerobot_check.py`: {folder}, read with {LEROBOT.replace('==', ' ')} and with this package.",
+        f"Written by `benchmarks/lerobot_check.py`: {folder}, read with {LEROBOT.replace('==', ' ')} and this package.",
         "",
         "| decoder | torch, torchvision | episodes | frames | images | largest mean difference of an image | result |",
         "| --- | --- | --- | --- | --- | --- | --- |",

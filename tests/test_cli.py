@@ -59,7 +59,7 @@ def test_what_belongs_to_something_else_is_refused_and_left_alone(tmp_path, caps
         bookmarks.execute("CREATE TABLE bookmarks (address TEXT)")
     before = (tmp_path / "bookmarks.sqlite").read_bytes()
     code, line = refused(["samples", str(tmp_path / "bookmarks.sqlite")], capsys)
-    assert (code, "something else" in line) == (2, True)
+    assert (code, "another program" in line) == (2, True)
     assert (tmp_path / "bookmarks.sqlite").read_bytes() == before
     (tmp_path / "episodes.parquet").touch()
     code, line = refused(["demo", "--out", str(tmp_path)], capsys)

@@ -69,12 +69,12 @@ def examine(folder: Path) -> Iterator[Finding]:
     yield _mujoco_renderer()
     yield _attempt("embedded model", _embedded_model, install_command("embedded"))
     yield _attempt("keypoint features", _features, install_command("vision"))
-    key = "OPENAI_API_KEY"
-    yield Finding(
-        "OpenAI key",
-        True,
-        f"{key} is set" if os.environ.get(key) else f"{key} is not set; needed only for --llm openai:…",
-    )
+    for key, needed in (
+        ("OPENAI_API_KEY", "for --llm openai:…"),
+        ("RIP_API_KEY", "for other servers, --llm http…"),
+    ):
+        status = f"{key} is set" if os.environ.get(key) else f"{key} is not set; needed only {needed}"
+        yield Finding(key, True, status)
     free = shutil.disk_usage(_existing(folder)).free / 1e9
     yield Finding("disk", free >= NEEDED_DISK_GB, f"{free:.1f} GB free", f"free at least {NEEDED_DISK_GB:.0f} GB")
     memory = _available_memory_gb()

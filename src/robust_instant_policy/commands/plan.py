@@ -43,5 +43,7 @@ def run(options: argparse.Namespace) -> int:
     finally:
         model.close()
     plan.save(options.out)
+    for note in plan.notes:
+        screen.say(f"    {note}")
     screen.say(f"{options.out}: {len(plan.trajectory)} steps, confidence {plan.confidence:.2f}")
     return 0

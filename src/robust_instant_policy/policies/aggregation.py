@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.errors import InvalidValueError, PlanningError
-from robust_instant_policy.policies.confidence import Evidence, novelty, plan_confidence
+from robust_instant_policy.policies.confidence import UNKNOWN_NOTE, Evidence, novelty, plan_confidence
 from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.policy import Plan, Stage, Stopwatch, Usage
 from robust_instant_policy.policies.sampling import Proposal
@@ -88,6 +88,7 @@ def make_plan(
         novelty(context.keypoints, scene.keypoints),
         (*context.report.findings, *scene.findings, *outside),
     )
+    unknown = (UNKNOWN_NOTE,) if judged and not evidence.is_known else ()
     return Plan(
         trajectory=trajectory,
         candidates=proposal.candidates,
@@ -102,5 +103,5 @@ def make_plan(
         pixels=scene.located.pixels,
         keypoint_confidence=scene.located.confidence,
         usage=Usage((scene.stage, *proposal.stages, *stages)),
-        notes=(*context.notes, *scene.notes, *proposal.notes, *map(str, outside)),
+        notes=(*context.notes, *scene.notes, *proposal.notes, *map(str, outside), *unknown),
     )

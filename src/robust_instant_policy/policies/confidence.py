@@ -20,6 +20,11 @@ from robust_instant_policy.sanity import Finding, errors
 COEFFICIENTS = {"constant": 3.0, "agreement": 1.0, "keypoints": 1.0, "prediction": 1.0, "novelty": 1.0, "warnings": 1.0}
 UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
 
+UNKNOWN_NOTE = (
+    "unchecked: the demonstrations cannot tell how well they predict a new scene (fewer than three, or all of one "
+    f"scene); the confidence is at most {UNKNOWN}"
+)
+
 RECOGNISED = 0.5  # confidence of keypoints from which on a scene counts as recognised; 0.7 to 0.8 is usual
 GOOD_KEYPOINTS = 0.8  # above which more says nothing
 GOOD_PREDICTION_M = 0.010  # below which demonstrations predict each other as well as keypoints are measured

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -193,6 +193,15 @@ def _candidate_table(plan: Plan) -> Table:
     return Table(("candidate", "verdict", "ignored from", "score", "mean weight", "steps"), tuple(rows), "")
 
 
+EVIDENCE: dict[str, tuple[str, Callable[[float], str]]] = {
+    "agreement": ("agreement of the candidates", lambda value: f"{value:.2f}"),
+    "prediction": ("error with which demonstrations predict each other", lambda value: f"{MM * value:.0f} mm"),
+    "novelty": ("distance of the scene from the nearest demonstration, 1 is usual", lambda value: f"{value:.1f}"),
+    "warnings": ("warnings of the checks", lambda value: f"{value:.0f}"),
+    "errors": ("errors of the checks", lambda value: f"{value:.0f}"),
+}  # see `policies.confidence.Evidence`
+
+
 def _confidence_table(plan: Plan) -> Table:
     """The confidence and what it depends on."""
     lengths = np.arange(plan.scale.shape[1]) % ACTION_DIM != STATE_INDEX
@@ -206,6 +215,7 @@ def _confidence_table(plan: Plan) -> Table:
     if len(plan.keypoint_confidence):
         quarter, least = np.quantile(plan.keypoint_confidence, (0.25, 0.0))
         rows.append(("keypoint confidence, lower quartile and lowest", f"{quarter:.2f}, {least:.2f}"))
+    rows += [(words, form(plan.evidence[name])) for name, (words, form) in EVIDENCE.items() if name in plan.evidence]
     if plan.confidence is not None:
         rows.insert(0, ("**confidence**", f"**{plan.confidence:.2f}**"))
     return Table(("quantity", "value"), tuple(rows), "")

@@ -34,7 +34,7 @@ LESS_LEVEL = 0.05  # by which the share of readings on the table may be lower un
 COARSE_PX = 112  # longer edge of the grid on which hypotheses are compared
 TESTED = 6  # demonstrations on which hypotheses are compared
 PAIRED = 20  # demonstrations among which images are exchanged
-PAIRINGS = 6  # wrong pairings of images and paths that the right one is compared with
+PAIRINGS = 3  # wrong pairings of images and paths that the right one is compared with
 
 
 @dataclass(frozen=True, eq=False)

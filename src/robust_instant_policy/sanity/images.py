@@ -28,7 +28,7 @@ from robust_instant_policy.sanity.hypotheses import reordered_quaternions
 from robust_instant_policy.sanity.image import check_image
 from robust_instant_policy.sanity.view import View
 
-PAIRED = 0.12  # by which the own images' consistency must exceed that of other images
+PAIRED = 0.2  # by which the own images' consistency must exceed that of other images
 CLOSE_M = 0.015  # gap from which a path is compared with other hypotheses, too
 LOWEST_PALM_M = 0.02  # above the table
 MOSTLY = 0.8  # share of the demonstrations
@@ -69,7 +69,11 @@ def check_contact(
     count, score = len(views), today.surroundings.score
     touches = today.touching >= MIN_SHARE or today.grasping >= MIN_SHARE
     repeats = not np.isfinite(score) or score >= CONSISTENT
-    right = today.clear >= MIN_SHARE and touches and repeats and today.level > 0
+    own, other = score, float("nan")
+    if count > MIN_DEMONSTRATIONS and scene_spread(views) > ONE_SCENE_M:
+        own, other = pairing_scores(views, poses)
+    exchangeable = own < other + PAIRED
+    right = today.clear >= MIN_SHARE and touches and repeats and today.level > 0 and not exchangeable
     if right and np.mean([c.path < CLOSE_M for c in today.contacts]) >= MIN_SHARE:
         return _outliers(views, today)
     numbers = {
@@ -77,6 +81,7 @@ def check_contact(
         "grasp_gap": today.grasp_gap,
         "lowest": today.lowest,
         "consistency": score,
+        "other_images": other,
         "touching": today.touching,
         "clear": today.clear,
     }
@@ -103,9 +108,7 @@ def check_contact(
         advice = "; check the camera's pose, the tool's offset and which image belongs to which path"
         words = _measured(today) + (advice if closes else "; nothing closes there, so it was not checked further")
         return [Finding("contact", "error" if closes else "warning", words, numbers)]
-    own, other = pairing_scores(views, poses)
-    numbers |= {"own_images": own, "other_images": other}
-    if count > MIN_DEMONSTRATIONS and own < other + PAIRED and scene_spread(views) > ONE_SCENE_M:
+    if exchangeable:
         words = f"the paths fit their own images no better than each other's ({own:.2f} against {other:.2f} of 1)"
         advice = "; trajectories are shuffled against images, or the images are mirrored, or of another camera"
         return [Finding("contact", "error", words + advice, numbers, "other images")]
