@@ -1,4 +1,4 @@
-"""The K points that all demonstrations share, and where they are in a new image (Oh et al. 2025, Sec. IV-A)."""
+"""The K points that all demonstrations share, and where they are in a new image (Oh et al. 2025, Sec. III-A)."""
 
 from __future__ import annotations
 

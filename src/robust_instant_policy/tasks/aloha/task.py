@@ -9,7 +9,7 @@ from robust_instant_policy.tasks.aloha.cell import CONTROL_HZ, WORKSPACE, AlohaE
 from robust_instant_policy.tasks.aloha.robot import viperx
 from robust_instant_policy.tasks.simulated_task import SimulatedTask, TaskSpec, Timing
 
-# "recorded at 10 Hz, but will be 1 Hz during the test phase to ensure stability" (Oh et al. 2025, Sec. V-A)
+# "recorded at 10 Hz, but will be 1 Hz during the test phase to ensure stability" (Oh et al. 2025, Sec. V-A.1)
 TIMING = Timing(control_hz=CONTROL_HZ, record_every=5, frame_every=10, execute_hz=1.0)
 
 

@@ -19,7 +19,7 @@ from robust_instant_policy.tasks.maniskill.robot import (
     URDF_PATH,
 )
 
-EXECUTE_HZ = 5.5  # "executed at 5.5 Hz" (Oh et al. 2025, Sec. V-A)
+EXECUTE_HZ = 5.5  # "5.5 Hz during the test phase" (Oh et al. 2025, Sec. V-A.1)
 JOINT_SPEED_LIMIT_RAD_S = 0.8 * np.pi  # the joints' 180 degrees/s, with a margin for tracking
 TOOL_SPEED_LIMIT_M_S = 1.0  # "typical TCP speed 1 m/s" (UR5e data sheet)
 

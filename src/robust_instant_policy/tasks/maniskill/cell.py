@@ -21,7 +21,7 @@ from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.tasks.maniskill.robot import FINGER_TRAVEL_M, UR5eHandE
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 
-RECORD_HZ = 55.0  # "recorded at 55 Hz" (Oh et al. 2025, Sec. V-A)
+RECORD_HZ = 55.0  # "recorded at 55 Hz" (Oh et al. 2025, Sec. V-A.1)
 SIM_HZ = 220
 
 BASE_POSITION_M = (-0.5, 0.0, 0.0)
