@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     if options.demos.isdecimal() and int(options.demos) == 0:
-        raise UsageError("--demos 0: at least one demonstration is needed")
+        raise UsageError("--demos 0: the task must be shown at least once")
     out = options.out or RUNS / f"{options.task}-{options.seed}"
     run_demo(options.task, options.llm, options.seed, options.demos, out, DATA, method_settings(options))
     return 0
