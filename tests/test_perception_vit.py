@@ -3,7 +3,9 @@
 import json
 import math
 import shutil
+import threading
 import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from robust_instant_policy.errors import InvalidValueError, ModelError
 from robust_instant_policy.perception import PAPER_REAL, PAPER_SIMULATION, DescriptorSettings, KeypointExtractor
 from robust_instant_policy.perception.descriptors import DescriptorMap
-from robust_instant_policy.perception.vit import VisionTransformer, VitDescriptors
+from robust_instant_policy.perception.vit import VitDescriptors
 from robust_instant_policy.perception.vit_checkpoint import load_checkpoint
 from tests.test_perception import scenes
 
@@ -71,8 +73,8 @@ def vit_folder(tmp_path_factory):
 
 def test_tokens_and_saliency_are_those_of_transformers_own_model(saved):
     model, folder = saved
-    loaded = load_checkpoint(str(folder)).model
-    ours = VisionTransformer(loaded, loaded.config.patch_size)
+    checkpoint = load_checkpoint(str(folder))
+    stride = model.config.patch_size
     side = model.config.image_size
     batch = torch.randn(1, 3, side, side)
     special = 1 + getattr(model.config, "num_register_tokens", 0)
@@ -80,22 +82,26 @@ def test_tokens_and_saliency_are_those_of_transformers_own_model(saved):
         theirs = model(batch, output_hidden_states=True, output_attentions=True)
     for layer in range(3):
         expected = theirs.hidden_states[layer + 1][0, special:]
-        found = ours.features(batch, layer, "token")[0].reshape(expected.shape)
+        ours = VitDescriptors(checkpoint, DescriptorSettings(side, stride, layer, "token"))
+        found = ours.features(batch)[0].reshape(expected.shape)
         torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
     heads = [0, 2, 4, 5] if model.config.num_attention_heads == 6 else [0, 1, 2]
     attention = theirs.attentions[-1][0, heads, 0, special:].mean(dim=0)
     attention = (attention - attention.min()) / (attention.max() - attention.min())
-    torch.testing.assert_close(ours.features(batch, 1, "key")[1].flatten(), attention, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(ours.features(batch)[1].flatten(), attention, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("facet", ["query", "key", "value"])
 @pytest.mark.parametrize("layer", [0, 2])
 def test_facets_are_projections_of_the_normalised_tokens(vit_folder, facet, layer):
     weights = load_file(vit_folder / "model.safetensors")
-    model = load_checkpoint(str(vit_folder)).model
-    ours = VisionTransformer(model, 8)
+    checkpoint = load_checkpoint(str(vit_folder))
     batch = torch.randn(1, 3, 64, 64)
-    tokens = ours.features(batch, layer - 1, "token")[0].reshape(64, -1) if layer else model.embeddings(batch)[0, 1:]
+
+    def features(layer: int, facet: str) -> torch.Tensor:
+        return VitDescriptors(checkpoint, DescriptorSettings(64, 8, layer, facet)).features(batch)[0].reshape(64, 48)
+
+    tokens = features(layer - 1, "token") if layer else checkpoint.model.embeddings(batch)[0, 1:]
     block = f"encoder.layer.{layer}"
     normed = torch.nn.functional.layer_norm(
         tokens, (48,), weights[f"{block}.layernorm_before.weight"], weights[f"{block}.layernorm_before.bias"], 1e-12
@@ -103,12 +109,11 @@ def test_facets_are_projections_of_the_normalised_tokens(vit_folder, facet, laye
     name = f"{block}.attention.attention.{facet}"
     expected = normed @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
     expected = expected.reshape(64, 6, 8).transpose(1, 2).reshape(64, 48)  # the reference keeps heads innermost
-    found = ours.features(batch, layer, facet)[0].reshape(64, 48)
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(features(layer, facet), expected, atol=1e-5, rtol=1e-4)
 
 
 def test_overlapping_patches_get_position_encodings_between_the_trained_ones(vit_folder):
-    ours = VisionTransformer(load_checkpoint(str(vit_folder)).model, 2)
+    ours = VitDescriptors(load_checkpoint(str(vit_folder)), PAPER_SIMULATION)
     table = load_file(vit_folder / "model.safetensors")["embeddings.position_embeddings"]
     rows, cols = 21, 29
     dense = ours.positions(rows, cols)[0, 1:].reshape(rows, cols, 48)
@@ -178,8 +183,9 @@ def test_the_papers_settings_give_the_papers_grids(vit_folder, settings, shape, 
         np.random.default_rng(0).integers(0, 255, (*shape, 3), dtype=np.uint8)
     )
     assert described.grid == grid
-    np.testing.assert_allclose(described.pixels[0], (3.5, 3.5))
-    np.testing.assert_allclose(described.pixels[-1], np.array(shape[::-1]) - 4.5, atol=settings.stride)
+    np.testing.assert_allclose(described.origin, 3.5)
+    last = described.origin + described.step * (np.array(grid[::-1]) - 1)
+    np.testing.assert_allclose(last, np.array(shape[::-1]) - 4.5, atol=settings.stride)
     assert described.saliency.min() == 0
     assert described.saliency.max() == 1
 
@@ -266,6 +272,51 @@ def test_a_broken_file_is_told_in_one_line(tmp_path):
     assert "\n" not in str(error.value)
 
 
+def test_weights_come_from_the_hub_and_then_from_its_cache(vit_folder, monkeypatch, tmp_path):
+    commit, files = "c" * 40, {file.name: file.read_bytes() for file in vit_folder.iterdir()}
+
+    class Hub(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            name = self.path.rsplit("/", 1)[1]
+            if "/tree/" in self.path:
+                body = json.dumps(
+                    [{"type": "file", "path": file, "size": len(files[file]), "oid": "0" * 40} for file in files]
+                ).encode()
+            elif self.path.startswith("/api/"):
+                siblings = [{"rfilename": file} for file in files]
+                body = json.dumps({"id": "some/vit", "sha": commit, "siblings": siblings}).encode()
+            else:
+                body = files[name]
+            self.send_response(200)
+            self.send_header("ETag", f'"{name}"')
+            self.send_header("X-Repo-Commit", commit)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            if self.command == "GET":
+                self.wfile.write(body)
+
+        do_HEAD = do_GET
+
+        def log_message(self, *_: object) -> None: ...
+
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with ThreadingHTTPServer(("127.0.0.1", 0), Hub) as server:
+        address = f"http://127.0.0.1:{server.server_port}"
+        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", address)
+        monkeypatch.setattr(
+            "huggingface_hub.constants.HUGGINGFACE_CO_URL_TEMPLATE",
+            address + "/{repo_id}/resolve/{revision}/{filename}",
+        )
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        fetched = load_checkpoint("some/vit").model.state_dict()
+        server.shutdown()
+    cached = load_checkpoint("some/vit").model.state_dict()
+    expected = load_checkpoint(str(vit_folder)).model.state_dict()
+    assert all(
+        torch.equal(fetched[name], tensor) and torch.equal(cached[name], tensor) for name, tensor in expected.items()
+    )
+
+
 def test_without_a_connection_the_hub_is_given_up_within_seconds(monkeypatch, tmp_path):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
@@ -276,11 +327,14 @@ def test_without_a_connection_the_hub_is_given_up_within_seconds(monkeypatch, tm
     assert "\n" not in str(error.value)
 
 
-def test_strides_layers_and_facets_that_do_not_exist_are_refused(vit_folder):
-    checkpoint = load_checkpoint(str(vit_folder)).model
-    with pytest.raises(InvalidValueError, match="stride 3 must divide the patch size 8"):
-        VisionTransformer(checkpoint, 3)
-    with pytest.raises(InvalidValueError, match="layer must be 0 to 10"):
-        VisionTransformer(checkpoint, 8).features(torch.zeros(1, 3, 64, 64), 11, "key")
-    with pytest.raises(InvalidValueError, match="facet must be one of key, query, value, token"):
-        VisionTransformer(checkpoint, 8).features(torch.zeros(1, 3, 64, 64), 1, "keys")
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (DescriptorSettings(64, stride=3), "stride 3 must divide the patch size 8"),
+        (DescriptorSettings(64, stride=8, layer=11), "layer must be 0 to 10"),
+        (DescriptorSettings(64, stride=8, facet="keys"), "facet must be one of key, query, value, token"),
+    ],
+)
+def test_strides_layers_and_facets_that_do_not_exist_are_refused(vit_folder, settings, words):
+    with pytest.raises(InvalidValueError, match=words):
+        VitDescriptors(load_checkpoint(str(vit_folder)), settings)

@@ -1,44 +1,57 @@
-"""Depth of a surface where the image has holes and flying pixels."""
+"""Depth of the surface at a pixel, in images with holes and flying pixels."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.geometry import FloatArray, lift, project
+from robust_instant_policy.perception.descriptors import Float32Array
 from robust_instant_policy.pointcloud import SURFACE_TOLERANCE
 
-MIN_SUPPORT = 3  # readings of a surface below which it is taken for flying pixels
+WINDOW_PX = 2  # on each side of a pixel
+MIN_SUPPORT = 3  # readings; fewer are flying pixels
+MAX_LIFT_M = 0.02  # a surface further from where a point is expected is another object's
 
 
-def surface_depth(depth: NDArray[np.float32], pixels: ArrayLike, radius: int = 2) -> FloatArray:
-    """Depth ``(N,)`` of the surface seen at ``pixels (N, 2)``, in the unit of ``depth``; NaN where there is none.
+def surface_depth(depth: Float32Array, pixels: ArrayLike) -> FloatArray:
+    """Depth ``(N,)`` of the surface at ``pixels (N, 2)``, in the unit of ``depth (H, W)``; NaN where there is none.
 
-    The readings within ``radius`` pixels are split into surfaces wherever they jump by more than
-    `SURFACE_TOLERANCE`. The surface of the centre pixel counts if at least `MIN_SUPPORT` readings belong to it,
-    otherwise (a hole, a flying pixel) the one with the most readings, the nearer of two. The answer is its median.
+    The readings of a window, sorted, are split into surfaces where they jump by more than `SURFACE_TOLERANCE`. The
+    result is the median of the centre's surface if that has `MIN_SUPPORT` readings, otherwise (a hole, a flying
+    pixel) of the surface with the most, the nearest of equals.
     """
     height, width = depth.shape
     centre = np.rint(np.asarray(pixels, dtype=np.float64)).astype(np.intp)
-    offsets = np.arange(-radius, radius + 1)
+    offsets = np.arange(-WINDOW_PX, WINDOW_PX + 1)
     rows = centre[:, 1, None, None] + offsets[:, None]
     cols = centre[:, 0, None, None] + offsets
     inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
     windows = np.where(inside, depth[rows.clip(0, height - 1), cols.clip(0, width - 1)], np.nan)
     windows = windows.reshape(len(centre), -1)
-    middle = windows[:, windows.shape[1] // 2]
+    middle = windows[:, windows.shape[1] // 2, None]
     readings = np.sort(windows, axis=1)  # missing ones last
-    rows, last = np.arange(len(readings)), windows.shape[1] - 1
-    jump = np.diff(readings, axis=1) > SURFACE_TOLERANCE * readings[:, :-1]
-    surface = np.zeros(windows.shape, dtype=np.intp)  # number of the surface that a reading belongs to
-    surface[:, 1:] = jump.cumsum(axis=1)
-    numbers = surface + rows[:, None] * windows.shape[1]
-    size = np.bincount(numbers[np.isfinite(readings)], minlength=readings.size).reshape(windows.shape)
-    # A missing centre is compared false throughout, so it belongs to no surface.
-    own = surface[rows, np.minimum((readings < middle[:, None]).sum(axis=1), last)]
-    chosen = np.where(np.isfinite(middle) & (size[rows, own] >= MIN_SUPPORT), own, size.argmax(axis=1))
-    count = size[rows, chosen]
-    first = (surface < chosen[:, None]).sum(axis=1)
-    lower = readings[rows, first + np.maximum(count - 1, 0) // 2].astype(np.float64)
-    upper = readings[rows, np.minimum(first + count // 2, last)]
-    return np.where(count >= MIN_SUPPORT, (lower + upper) / 2, np.nan)
+    jumps = np.diff(readings, axis=1) > SURFACE_TOLERANCE * readings[:, :-1]
+    surface = np.pad(jumps.cumsum(axis=1), ((0, 0), (1, 0)))
+    same = (surface[:, :, None] == surface[:, None, :]) & np.isfinite(readings)[:, None, :]
+    support = same.sum(axis=2)
+    preferred = (readings == middle) & (support >= MIN_SUPPORT)
+    chosen = np.where(preferred, readings.shape[1], support).argmax(axis=1)
+    members = np.take_along_axis(same, chosen[:, None, None], axis=1)[:, 0]
+    members &= members.sum(axis=1, keepdims=True) >= MIN_SUPPORT
+    return np.ma.filled(np.ma.median(np.ma.array(readings.astype(np.float64), mask=~members), axis=1), np.nan)
+
+
+def lift_to_surface(
+    observation: Observation, depth: Float32Array, points: FloatArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """``points (N, 3)``, metres, world, moved along their rays onto the surface in ``depth (H, W)``, metres.
+
+    Also their pixels ``(N, 2)`` and which have a surface within `MAX_LIFT_M`; the others stay where they are.
+    """
+    pixels = project(points, observation.intrinsics, observation.camera_pose)
+    found = surface_depth(depth, pixels)
+    lifted = lift(pixels, np.nan_to_num(found), observation.intrinsics, observation.camera_pose)
+    measured = np.isfinite(found) & (np.linalg.norm(lifted - points, axis=1) < MAX_LIFT_M)
+    return np.where(measured[:, None], lifted, points), pixels, measured

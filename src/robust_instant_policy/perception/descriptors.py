@@ -1,4 +1,4 @@
-"""Dense descriptors of one image, and their cosine similarities without ever writing them out in full."""
+"""Dense descriptors of one image, and their cosine similarities without the full matrix of log bins."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ PLAIN = ((0, 0, 0),)
 class DescriptorMap:
     """Descriptors on a regular grid of patches.
 
-    ``features (rows, cols, D)`` float32; ``saliency (rows, cols)`` in [0, 1]; the patch in row r and column c is
-    centred on pixel ``origin + step · (c, r)`` (u, v) of the original image. Cells are numbered row by row.
-    With ``log_bins`` a descriptor is that of 17 bins around its patch, of 17·D numbers.
+    ``features (rows, cols, D)``; ``saliency (rows, cols)`` in [0, 1]; the patch in row r and column c is centred on
+    pixel ``origin + step · (c, r)`` (u, v) of the original image. A cell is the number of a patch, row by row.
+    With ``log_bins`` a descriptor consists of 17 bins around its patch, 17·D numbers.
     """
 
     features: Float32Array
@@ -56,7 +56,7 @@ class DescriptorMap:
         if not self.log_bins:
             return (flat,)
         pooled, weight = self.features, np.ones((*self.grid, 1), dtype=np.float32)
-        for axis in (0, 1):  # outside the image there is nothing to average
+        for axis in (0, 1):  # means of the pixels inside the image only
             pooled = uniform_filter1d(pooled, 3, axis=axis, mode="constant")
             weight = uniform_filter1d(weight, 3, axis=axis, mode="constant")
         return flat, (pooled / weight).reshape(flat.shape)
@@ -69,20 +69,14 @@ class DescriptorMap:
         total = sum(squares[level][self.shifted(cells, row, col)] for level, row, col in self.bins)
         return np.sqrt(np.maximum(total, TINY))
 
-    @cached_property
-    def pixels(self) -> FloatArray:
-        """Patch centres ``(rows · cols, 2)``, (u, v) in the original image."""
-        rows, cols = np.indices(self.grid).reshape(2, -1)
-        return self.origin + self.step * np.stack([cols, rows], axis=1)
-
     def cells_at(self, pixels: ArrayLike) -> IntArray:
-        """Numbers of the cells nearest to ``pixels (..., 2)``."""
+        """The cells ``(...)`` nearest to ``pixels (..., 2)``."""
         rows, cols = self.grid
         index = np.rint((np.asarray(pixels) - self.origin) / self.step).astype(np.intp)
         return np.clip(index[..., 1], 0, rows - 1) * cols + np.clip(index[..., 0], 0, cols - 1)
 
     def around(self, pixels: ArrayLike) -> tuple[IntArray, FloatArray]:
-        """The four cells around each of ``pixels (n, 2)`` and their shares in bilinear interpolation, ``(n, 4)``."""
+        """The four cells around each of ``pixels (n, 2)`` and their bilinear weights, both ``(n, 4)``."""
         rows, cols = self.grid
         place = np.clip((np.asarray(pixels) - self.origin) / self.step, 0, (cols - 1, rows - 1))
         corner = np.minimum(place.astype(np.intp), (cols - 2, rows - 2))
@@ -92,21 +86,20 @@ class DescriptorMap:
         return np.stack([cell, cell + 1, cell + cols, cell + cols + 1], axis=1), np.stack(shares, axis=1)
 
     def shifted(self, cells: IntArray, row: int, col: int) -> IntArray:
-        """The cells ``row`` down and ``col`` to the right of ``cells``, held at the border."""
+        """The cells ``row`` below and ``col`` to the right of ``cells``, clamped to the border."""
         rows, cols = self.grid
         return np.clip(cells // cols + row, 0, rows - 1) * cols + np.clip(cells % cols + col, 0, cols - 1)
 
     def vectors(self, cells: IntArray) -> Float32Array:
-        """The full descriptors of chosen cells ``(n, D)``, or ``(n, 17·D)``; for a few cells only."""
-        return np.concatenate(
-            [self.levels[level][self.shifted(cells, row, col)] for level, row, col in self.bins], axis=1
-        )
+        """The full descriptors of ``cells (n,)``: ``(n, D)``, or ``(n, 17·D)`` with log bins."""
+        parts = [self.levels[level][self.shifted(cells, row, col)] for level, row, col in self.bins]
+        return np.concatenate(parts, axis=1)
 
     def similarities(self, cells: IntArray, other: DescriptorMap, other_cells: IntArray) -> Float32Array:
-        """Cosine similarities ``(n, m)`` between chosen cells of two maps of one network.
+        """Cosine similarities ``(n, m)`` of ``cells (n,)`` and ``other_cells (m,)``, two maps of one network.
 
-        A binned descriptor is 17 shifted copies of unbinned ones, so its products are sums of shifted unbinned
-        products: each pair of patches is multiplied once per level, and the sums only gather.
+        A log-binned descriptor consists of 17 shifted plain ones, so its products are sums of shifted plain products,
+        each computed once per level.
         """
         if not self.log_bins:
             products = self.levels[0][cells] @ other.levels[0][other_cells].T
@@ -124,7 +117,7 @@ class DescriptorMap:
 
 
 class DescriptorNetwork(Protocol):
-    """What turns images into descriptor maps; patches whose saliency exceeds ``salient`` stand out."""
+    """A network that describes images; patches whose saliency exceeds ``salient`` may be foreground."""
 
     name: str
     salient: float

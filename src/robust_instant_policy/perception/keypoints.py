@@ -1,35 +1,34 @@
-"""The K points that all demonstrations share, and where they are in a new image (Oh et al. 2025, Sec. III-A)."""
+"""K points that all demonstrations share, and their places in a new image (Oh et al. 2025, Sec. III-A)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError
-from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.perception.cloud import foreground
+from robust_instant_policy.geometry import FloatArray, transform_points
+from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.network import choose_network
-from robust_instant_policy.perception.objects import MovingObject, Registration, View, moving_objects
-from robust_instant_policy.perception.registration import NEAR_M, local_shift
-from robust_instant_policy.perception.selection import lifted, select
+from robust_instant_policy.perception.objects import Registration, RigidObject, find_objects, register
+from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
+from robust_instant_policy.perception.selection import select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
+from robust_instant_policy.perception.view import View, make_view
 
-MIN_FIT = 0.15  # share of an object's points that must be explained in every demonstration
-MIN_OBJECT_POINTS = 25
-SAME_SHAPE = 0.7  # fit from which an object is the reference's own shape, so that keypoints need no following
-PATCH_M = 0.04  # around a keypoint that must match for it to follow
-OFF_CENTRE = 0.4  # of half the image; no lens is mounted that far off
+MIN_FITNESS = 0.15  # of an object's registration in every demonstration
+SAME_SHAPE_FITNESS = 0.7  # from which keypoints need no registration of their own
+NEIGHBOURHOOD_M = 0.04  # around a keypoint, for a registration of its own
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
     """Keypoints of one image: ``keypoints (K, 3)`` metres, world; ``pixels (K, 2)`` (u, v);
-    ``confidence (K,)`` in [0, 1]; ``notes`` say what was unusual.
+    ``confidence (K,)`` in [0, 1]; ``notes`` tell what was unusual, one line each.
     """
 
     keypoints: FloatArray
@@ -38,28 +37,15 @@ class Located:
     notes: tuple[str, ...] = ()
 
 
-def check_intrinsics(observation: Observation) -> None:
-    """Raise `KeypointError` where the optical axis is far from the image's middle, as with another resolution's."""
-    height, width = observation.depth.shape
-    cx, cy = observation.intrinsics[:2, 2]
-    if not (abs(cx / (width / 2) - 1) < OFF_CENTRE and abs(cy / (height / 2) - 1) < OFF_CENTRE):
-        raise KeypointError(
-            f"the intrinsics belong to an image of about {2 * cx:.0f}x{2 * cy:.0f} pixels, but this one has "
-            f"{width}x{height}; scale them to it"
-        )
-
-
 class KeypointExtractor:
-    """Finds keypoints that all demonstrations share, and finds the same ones in new images.
+    """Finds K keypoints that all demonstrations share, and the same ones in new images.
 
-    ``num_keypoints``: K. ``features``: see `choose_network`. ``workspace (2, 3)``: lower and upper
-    corner in metres, world; points outside are not looked at. Without ``settings``, the paper's for images of the
-    first one's size. Deterministic for a ``seed``.
+    ``num_keypoints``: K. ``features``: see `choose_network`. ``workspace (2, 3)``: lower and upper corner in metres,
+    world; points outside are ignored. ``settings``: by default the paper's for images of the first one's size.
+    Deterministic for a ``seed``.
 
-    After `fit`: ``keypoints_ (I, K, 3)`` metres, world; ``pixels_ (I, K, 2)`` (u, v); ``descriptor_name_``;
-    ``notes_``, one line each about anything a user should know.
-
-    Raises `KeypointError` when the images have too little in common or depth is missing.
+    After `fit`: ``keypoints_ (I, K, 3)`` metres, world, and ``pixels_ (I, K, 2)`` (u, v) of I demonstrations;
+    ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``notes_`` for the user, one line each.
     """
 
     def __init__(
@@ -79,41 +65,44 @@ class KeypointExtractor:
         self.settings = settings
 
     def fit(self, observations: Sequence[Observation]) -> KeypointExtractor:
+        """Choose keypoints and find them in ``observations``, the demonstrations' first images.
+
+        Raises `KeypointError` where the images have too little in common, or depth or foreground are missing.
+        """
         if not observations:
             raise KeypointError("no demonstrations were given; record at least one")
         settings = self.settings or paper_settings(*observations[0].rgb.shape[:2])
-        self._network, note = choose_network(self.features, settings)
-        self.descriptor_name_ = self._network.name
-        notes = [note]
-        views = []
-        for observation in observations:
-            view, note = self._view(observation)
-            views.append(view)
-            if note and note not in notes:
-                notes.append(note)
+        self.network_, note = choose_network(self.features, settings)
+        self.descriptor_name_ = self.network_.name
+        views = [make_view(observation, self.network_, self.workspace, self.seed) for observation in observations]
+        notes = [note, *dict.fromkeys(view.note for view in views if view.note)]
         if len(views) == 1:
             notes.append(
                 "one demonstration only: nothing to compare it with, so the keypoints are its most salient points"
             )
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
-        self._objects = self._shared(views)
-        if len(self._objects) > self.num_keypoints:
-            notes.append(
-                f"{len(self._objects)} objects were found for {self.num_keypoints} keypoints; the largest have one each"
+        objects = find_objects(views, self.seed)
+        self.objects_ = [thing for thing in objects if thing.worst_fitness >= MIN_FITNESS]
+        if not self.objects_:
+            best = max((thing.worst_fitness for thing in objects), default=0.0)
+            raise KeypointError(
+                f"the images have nothing in common: the best object of the first has a fitness of {best:.2f} in the "
+                f"worst other image (needed: {MIN_FITNESS:.2f}); do all demonstrations show the same object?"
             )
-            by_size = sorted(self._objects, key=lambda thing: len(thing.templates[0].painted), reverse=True)
-            self._objects = by_size[: self.num_keypoints]
-        owner: list[int] = []
-        places = []
-        for number, thing in enumerate(self._objects):
-            share = self.num_keypoints // len(self._objects) + (number < self.num_keypoints % len(self._objects))
-            points, replaced = select(thing, views, share, self.seed)
-            owner += [number] * share
-            places.append(points)
+        if len(self.objects_) > self.num_keypoints:
+            notes.append(
+                f"{len(self.objects_)} objects were found for {self.num_keypoints} keypoints; the largest have one each"
+            )
+            self.objects_.sort(key=lambda thing: len(thing.templates[0].xyzrgb), reverse=True)
+            del self.objects_[self.num_keypoints :]
+        share, more = divmod(self.num_keypoints, len(self.objects_))
+        self._places = []  # of each object's keypoints, in the first image
+        for number, thing in enumerate(self.objects_):
+            points, replaced = select_points(thing, views, share + (number < more), self.seed)
+            self._places.append(points)
             notes += replaced
-        self._owner, self._places = np.array(owner, dtype=np.intp), np.concatenate(places)
-        found = [self._place(view, [t.registrations[i] for t in self._objects]) for i, view in enumerate(views)]
+        found = [self._locate(view, [t.registrations[i] for t in self.objects_]) for i, view in enumerate(views)]
         self.keypoints_ = np.stack([located.keypoints for located in found])
         self.pixels_ = np.stack([located.pixels for located in found])
         self.notes_ = tuple(notes)
@@ -122,49 +111,39 @@ class KeypointExtractor:
     def locate(self, observation: Observation) -> Located:
         """The keypoints in a new image.
 
-        Raises `KeypointError` for an image in which nothing stands out, or without depth.
+        Raises `KeypointError` where depth or foreground are missing.
         """
-        view, note = self._view(observation)
-        located = self._place(view, [thing.find(view) for thing in self._objects])
-        return replace(located, notes=(note, *located.notes)) if note else located
+        view = make_view(observation, self.network_, self.workspace, self.seed)
+        return self._locate(view, [register(thing.templates, view) for thing in self.objects_])
 
-    def _place(self, view: View, registrations: list[Registration]) -> Located:
-        """The keypoints of objects that were found in ``view``."""
-        poses = np.stack([registrations[number].pose for number in self._owner])
-        expected = (poses[:, :3, :3] @ self._places[..., None])[..., 0] + poses[:, :3, 3]
-        for k, number in enumerate(self._owner):
-            if registrations[number].fit < SAME_SHAPE:
-                template = self._objects[number].templates[0].painted
-                patch = template[np.linalg.norm(template[:, :3] - self._places[k], axis=1) < PATCH_M]
-                near = view.painted[np.linalg.norm(view.painted[:, :3] - expected[k], axis=1) < 2 * PATCH_M]
-                if len(near):
-                    expected[k] += local_shift(poses[k], patch, near)
-        points, pixels, hanging = lifted(view, expected)
-        belief = np.array([(r.fit + r.agreement) / 2 for r in registrations])[self._owner]
-        confidence = belief * np.exp(-(((points - expected) ** 2).sum(axis=1)) / NEAR_M**2)
-        confidence[hanging] /= 2
-        notes = [f"keypoint {k} has no depth at its pixel; it is where its object says" for k in hanging]
-        for number, registration in enumerate(registrations):
-            if registration.fit < MIN_FIT:
-                notes.append(f"object {number} was hardly recognised (fit {registration.fit:.2f})")
+    def _locate(self, view: View, registrations: Sequence[Registration]) -> Located:
+        """The keypoints of objects with known ``registrations`` in ``view``."""
+        triples = zip(self.objects_, self._places, registrations, strict=True)
+        expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
+        points, pixels, measured = lift_to_surface(view.observation, view.depth, expected)
+        counts = [len(places) for places in self._places]
+        confidence = np.repeat([(found.fitness + found.similarity) / 2 for found in registrations], counts)
+        confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / RESIDUAL_M**2)
+        confidence[~measured] /= 2
+        notes = [view.note] if view.note else []
+        for k in np.flatnonzero(~measured):
+            notes.append(f"keypoint {k} has no depth at its pixel; it is where its object says")
+        for number, found in enumerate(registrations):
+            if found.fitness < MIN_FITNESS:
+                notes.append(f"object {number} was hardly recognised (fit {found.fitness:.2f})")
         return Located(points, pixels, np.clip(confidence, 0, 1), tuple(notes))
 
-    def _view(self, observation: Observation) -> tuple[View, str]:
-        check_intrinsics(observation)
-        descriptors = self._network.describe(observation.rgb)
-        cloud, note = foreground(observation, descriptors, self._network.salient, self.workspace, self.seed)
-        if len(cloud.points) < MIN_OBJECT_POINTS:
-            raise KeypointError("nothing stands out from the table in an image; is the object in the workspace?")
-        return View.from_cloud(observation, descriptors, cloud, self.seed), note
 
-    def _shared(self, views: list[View]) -> list[MovingObject]:
-        """The objects that all views show."""
-        found = moving_objects(views, MIN_OBJECT_POINTS, self.seed)
-        shared = [thing for thing in found if thing.worst_fit >= MIN_FIT]
-        if not shared:
-            best = max((thing.worst_fit for thing in found), default=0.0)
-            raise KeypointError(
-                f"the images have nothing in common: the best object of the first explains {best:.2f} of itself in the "
-                f"worst other image (needed: {MIN_FIT:.2f}); do all demonstrations show the same object?"
-            )
-        return shared
+def _expected_places(view: View, thing: RigidObject, places: FloatArray, found: Registration) -> FloatArray:
+    """Where ``places (k, 3)`` of an object in the first image are in ``view``, metres, world."""
+    expected = transform_points(found.pose, places)
+    if found.fitness >= SAME_SHAPE_FITNESS:
+        return expected
+    # An object of another size or articulation: register the neighbourhood of each keypoint.
+    template = thing.templates[0].xyzrgb
+    for k, place in enumerate(places):
+        source = template[np.linalg.norm(template[:, :3] - place, axis=1) < NEIGHBOURHOOD_M]
+        target = view.target[np.linalg.norm(view.target[:, :3] - expected[k], axis=1) < 2 * NEIGHBOURHOOD_M]
+        if len(target):
+            expected[k] += register_translation(found.pose, source, target)
+    return expected

@@ -1,8 +1,7 @@
-"""Where an object went: the turn about the vertical and the shift that carry its points onto a new image's points.
+"""Registration of XYZRGB points by a rotation about the vertical and a translation.
 
-Descriptors propose, geometry decides. Every pair of similar descriptors votes for the motions that would explain it
-(Hough 1962); the best motions are polished by matching nearest points in space and colour (ICP, Besl and McKay 1992).
-Objects stand on a table, so motions turn about the world's vertical only.
+Descriptor matches vote for motions (Hough 1962); ICP in space and colour (Besl and McKay 1992) refines the best.
+Objects stand on a table, so rotations are about the world's z axis only.
 """
 
 from __future__ import annotations
@@ -10,165 +9,162 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robust_instant_policy.geometry import FloatArray, fit_upright, rotations_about_vertical, transform_points
-from robust_instant_policy.perception.descriptors import Float32Array
+from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 
-TURN_BINS = 24
+ANGLE_BINS = 24
 SHIFT_BIN_M = 0.015
-PEAKS = 4
+MAX_PEAKS = 4
+SUPPRESSED_BINS = 3  # around a peak, on each side
 MATCHES_PER_POINT = 3
-MAX_VOTERS = 400  # the most similar matches; the others say nothing new
-VOTE_SHARPNESS = 4  # power of the similarity with which a match votes
-COLOUR_SCALE_M = 0.06  # metres that count as much as the difference between black and white in one channel
-COLOUR_CAP_M = 0.010  # and no difference counts more: objects of one kind come in many colours
-NEAR_M = 0.010  # residual at which a point counts about a third
-OWN_M = 0.04  # image points further from the object are not its own
-VARIANT_TURNS = np.deg2rad([0.0, -25.0, 25.0])
-SYMMETRY_TURNS = np.deg2rad([-20.0, -15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0])  # the middle one is none
-SYMMETRY_LOSS = 0.04  # of the fit; an object that loses less by these turns looks the same from all sides
-OPINION_SCALE = 0.01  # of the agreement; how much a worse turn counts
+MAX_MATCHES = 400  # the most similar; more do not change the peaks
+VOTE_EXPONENT = 4  # of the similarity, for a match's vote
+COLOUR_CAP_M = 0.010  # greatest colour distance: objects of one kind have many colours
+RESIDUAL_M = 0.010  # at which a point counts 1/e in the fitness
+OWN_REACH_M = 0.04  # image points further from the object belong to others
+RESTART_ANGLES = np.deg2rad([0.0, -25.0, 25.0])
+SYMMETRY_ANGLES = np.deg2rad(np.arange(-20.0, 25.0, 5.0))  # the middle one is none
+MAX_SYMMETRY_LOSS = 0.04  # of the fitness, by these rotations, for a rotationally symmetric object
+SIMILARITY_SCALE = 0.01  # of the softmax over these rotations
 COARSE_POINTS = 60
 FINALISTS = 3
-COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)
-PATCH_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
+COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)  # kernel width in each ICP iteration
 FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
+LOCAL_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
+MIN_WEIGHT = np.float32(1e-9)  # keeps the weights' sum above zero
 
 
-def proposals(source: FloatArray, target: FloatArray, similarities: Float32Array) -> FloatArray:
-    """At most `PEAKS` motions ``(P, 4, 4)`` on which most matches agree, from ``similarities (N, M)``.
+def vote_for_motions(source: FloatArray, target: FloatArray, similarities: Float32Array) -> FloatArray:
+    """The motions ``(P, 4, 4)``, P at most `MAX_PEAKS`, with the most votes of descriptor matches.
 
-    Each of ``source (N, 3)`` is matched with the `MATCHES_PER_POINT` most similar of ``target (M, 3)``.
+    Each of ``source (N, 3)`` is matched with the `MATCHES_PER_POINT` of ``target (M, 3)``, metres, world, that have
+    the largest ``similarities (N, M)``.
     """
     count = min(MATCHES_PER_POINT, len(target))
     best = np.argpartition(-similarities, count - 1, axis=1)[:, :count]
-    # Turned about the object's middle, a shift is where the object goes, and few bins hold them all.
-    middle = source.mean(axis=0)
-    likeness = np.take_along_axis(similarities, best, axis=1).reshape(-1)
-    voters = np.argsort(-likeness, kind="stable")[:MAX_VOTERS]
-    p = (source - middle)[voters // count]
-    q = target[best.reshape(-1)[voters]]
-    weight = np.maximum(likeness[voters], 0).astype(np.float64) ** VOTE_SHARPNESS
-    turns = np.arange(TURN_BINS) * 2 * np.pi / TURN_BINS
-    cos, sin = np.cos(turns)[:, None], np.sin(turns)[:, None]
-    shift = np.stack([q[:, 0] - (cos * p[:, 0] - sin * p[:, 1]), q[:, 1] - (sin * p[:, 0] + cos * p[:, 1])], axis=-1)
-    bins = np.floor((shift - shift.min(axis=(0, 1))) / SHIFT_BIN_M).astype(np.intp) + 1
-    width, height = bins.max(axis=(0, 1)) + 2
-    flat = (np.arange(TURN_BINS)[:, None] * width + bins[..., 0]) * height + bins[..., 1]
-    votes = np.bincount(flat.reshape(-1), np.tile(weight, TURN_BINS), TURN_BINS * width * height)
-    votes = votes.reshape(TURN_BINS, width, height)
-    for axis in range(3):  # a motion on the border of a bin has its votes in two
+    # Rotations about the object's centre need the smallest range of shifts.
+    centre = source.mean(axis=0)
+    similarity = np.take_along_axis(similarities, best, axis=1).reshape(-1)
+    voters = np.argsort(-similarity, kind="stable")[:MAX_MATCHES]
+    p, q = (source - centre)[voters // count], target[best.reshape(-1)[voters]]
+    weights = np.maximum(similarity[voters], 0).astype(np.float64) ** VOTE_EXPONENT
+    rotations = rotations_about_vertical(np.arange(ANGLE_BINS) * 2 * np.pi / ANGLE_BINS)
+    shifts = (q - p @ np.swapaxes(rotations, 1, 2))[..., :2]
+    bins = np.floor((shifts - shifts.min(axis=(0, 1))) / SHIFT_BIN_M).astype(np.intp) + 1
+    shape = (ANGLE_BINS, *(bins.max(axis=(0, 1)) + 2))
+    votes = np.zeros(shape)
+    np.add.at(votes, (np.arange(ANGLE_BINS)[:, None], bins[..., 0], bins[..., 1]), weights)
+    for axis in range(3):  # a motion near the border of a bin has its votes in two
         votes = votes + np.roll(votes, 1, axis) + np.roll(votes, -1, axis)
-    motions = []
-    for _ in range(PEAKS):
-        turn, x, y = np.unravel_index(int(votes.argmax()), votes.shape)
-        if votes[turn, x, y] <= 0:
-            break
-        agree = np.zeros(len(p))
-        for near in (turn - 1, turn, turn + 1):
-            agree += (np.abs(bins[near % TURN_BINS] - (x, y)) <= 1).all(axis=1)
-        motions.append(fit_upright(p + middle, q, weight * (agree > 0)))
-        votes[np.arange(turn - 3, turn + 4) % TURN_BINS, max(0, x - 3) : x + 4, max(0, y - 3) : y + 4] = 0
+    motions: list[FloatArray] = []
+    while len(motions) < MAX_PEAKS and votes.max() > 0:
+        angle, x, y = np.unravel_index(int(votes.argmax()), shape)
+        close = (np.abs(bins[np.arange(angle - 1, angle + 2) % ANGLE_BINS] - (x, y)) <= 1).all(axis=2).any(axis=0)
+        motions.append(fit_upright(p + centre, q, weights * close))
+        near_angles = np.arange(angle - SUPPRESSED_BINS, angle + SUPPRESSED_BINS + 1) % ANGLE_BINS
+        near_x, near_y = (slice(max(0, at - SUPPRESSED_BINS), at + SUPPRESSED_BINS + 1) for at in (x, y))
+        votes[near_angles, near_x, near_y] = 0
     return np.array(motions)
 
 
-def polish(
-    motions: FloatArray, source: Float32Array, target: Float32Array, agreement: Callable[[FloatArray], FloatArray]
+def refine(
+    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Callable[[FloatArray], FloatArray]
 ) -> tuple[FloatArray, float, float]:
-    """The best of ``motions (P, 4, 4)`` after refinement, and its fit and agreement, both in [0, 1].
+    """The best motion ``(4, 4)`` after ICP from ``motions (P, 4, 4)``; its fitness and similarity, both in [0, 1].
 
-    ``source (N, 6)`` and ``target (M, 6)`` are points with their colours (see `painted`); ``agreement`` says how well
-    the descriptors agree with each of several motions. First all motions, and the same turned by `VARIANT_TURNS`,
-    on a few points; then the best `FINALISTS` on all points.
+    ``source (N, 6)`` and ``target (M, 6)`` are XYZRGB points; ``similarity`` is that of the descriptors under each of
+    several motions. A subset of the points selects `FINALISTS`, all points the best.
     """
-    middle = source[:, :3].mean(axis=0)
-    tries = np.concatenate([turned(motion, middle, VARIANT_TURNS) for motion in motions])
+    centre = source[:, :3].mean(axis=0)
+    starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
     coarse = source[:: max(1, len(source) // COARSE_POINTS)], target[:: max(1, len(target) // (3 * COARSE_POINTS))]
-    tries, fits = closest_points(tries, *coarse, COARSE_REACH_M)
-    leading = np.argsort(-fits - agreement(tries))[:FINALISTS]
-    finalists, fits = closest_points(tries[leading], source, target, FINE_REACH_M)
-    agreements = agreement(finalists)
-    best = int((fits + agreements).argmax())
+    starts, fitness = icp(starts, *coarse, COARSE_REACH_M)
+    leading = np.argsort(-fitness - similarity(starts))[:FINALISTS]
+    finalists, fitness = icp(starts[leading], source, target, FINE_REACH_M)
+    similarities = similarity(finalists)
+    best = int((fitness + similarities).argmax())
     motion = finalists[best]
-    near = turned(motion, middle, SYMMETRY_TURNS)
-    turned_fits = closest_points(near, *coarse, ())[1]
-    if turned_fits.min() > turned_fits[len(near) // 2] - SYMMETRY_LOSS:
-        # Points alone cannot tell how a disc is turned; the descriptors' opinion is averaged.
-        opinion = agreement(near)
-        share = np.exp((opinion - opinion.max()) / OPINION_SCALE)
-        motion = turned(motion, middle, np.atleast_1d(share @ SYMMETRY_TURNS / share.sum()))[0]
-    return motion, float(fits[best]), float(agreements[best])
+    alternatives = rotated(motion, centre, SYMMETRY_ANGLES)
+    rotated_fitness = icp(alternatives, *coarse, ())[1]
+    if rotated_fitness.min() > rotated_fitness[len(alternatives) // 2] - MAX_SYMMETRY_LOSS:
+        # Points do not determine the rotation of a disc: take the descriptors' mean rotation.
+        likelihood = similarity(alternatives)
+        share = np.exp((likelihood - likelihood.max()) / SIMILARITY_SCALE)
+        motion = rotated(motion, centre, np.atleast_1d(share @ SYMMETRY_ANGLES / share.sum()))[0]
+    return motion, float(fitness[best]), float(similarities[best])
 
 
-def turned(motion: FloatArray, middle: FloatArray, angles: FloatArray) -> FloatArray:
-    """``motion (4, 4)`` followed by upright turns by ``angles (A,)`` about ``middle (3,)``: ``(A, 4, 4)``."""
+def rotated(motion: FloatArray, centre: FloatArray, angles: FloatArray) -> FloatArray:
+    """``motion (4, 4)`` with additional rotations by ``angles (A,)`` radians about ``centre (3,)``: ``(A, 4, 4)``."""
     result = np.repeat(motion[None], len(angles), axis=0)
     result[:, :3, :3] = rotations_about_vertical(angles) @ motion[:3, :3]
-    result[:, :3, 3] += (motion[:3, :3] - result[:, :3, :3]) @ middle
+    result[:, :3, 3] += (motion[:3, :3] - result[:, :3, :3]) @ centre
     return result
 
 
-def closest_points(
+def icp(
     motions: FloatArray, source: Float32Array, target: Float32Array, reaches: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """ICP in both directions, one round for each of ``reaches`` (metres), matches much further apart not pulling.
+    """``motions (C, 4, 4)`` after one ICP iteration for each of ``reaches`` (kernel widths, metres), and their fitness.
 
-    Both directions, because an object slid along itself covers its old place well: only the points left bare tell.
+    Matches go both ways: an object shifted along itself still covers most of its image points, and only those left
+    uncovered show the error. The fitness in [0, 1] is the geometric mean of both ways.
     """
-    count, size = len(motions), len(source)
-    places, goals = np.ascontiguousarray(source[:, :3]), np.ascontiguousarray(target[:, :3])
-    fixed = _paint(source, target) + (goals**2).sum(axis=1)
-    towards = np.ascontiguousarray(-2 * goals.T)
-    costs = np.empty((count, size, len(target)), dtype=np.float32)  # one for all rounds: making it anew is slow
-    fits = np.zeros(count)
-    for reach in (*reaches, 0.0):
-        moved = (places @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]).astype(np.float32)
-        np.matmul(moved, towards, out=costs)
-        costs += fixed
-        costs += np.einsum("cnx,cnx->cn", moved, moved)[..., None]
-        forth, back = costs.argmin(axis=2), costs.argmin(axis=1)
-        forth_cost = np.take_along_axis(costs, forth[..., None], axis=2)[..., 0]
-        back_cost = np.take_along_axis(costs, back[:, None], axis=1)[:, 0]
-        own = back_cost < OWN_M**2  # the rest of the image belongs to something else
-        if reach:
-            weights = np.concatenate([np.exp(-forth_cost / reach**2), own * np.exp(-back_cost / reach**2)], axis=1)
-            source_points = np.concatenate([np.broadcast_to(places, (count, size, 3)), places[back]], axis=1)
-            target_points = np.concatenate([goals[forth], np.broadcast_to(goals, (count, len(goals), 3))], axis=1)
-            motions = fit_upright(source_points, target_points, weights + np.float32(1e-9))
-        else:
-            explained = (own * np.exp(-back_cost / NEAR_M**2)).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
-            fits = np.sqrt(np.exp(-forth_cost / NEAR_M**2).mean(axis=1) * explained)
-    return motions, fits
+    source_xyz, target_xyz = np.ascontiguousarray(source[:, :3]), np.ascontiguousarray(target[:, :3])
+    constant = colour_costs(source, target) + (target_xyz**2).sum(axis=1)
+    linear = np.ascontiguousarray(-2 * target_xyz.T)
+    costs = np.empty((len(motions), len(source), len(target)), dtype=np.float32)  # reused: allocation is slow
+
+    def match(motions: FloatArray) -> tuple[IntArray, IntArray, Float32Array, Float32Array, NDArray[np.bool_]]:
+        """Nearest targets of the sources, nearest sources of the targets, both squared distances, and which targets
+        are near enough to belong to the object.
+        """
+        moved = (source_xyz @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]).astype(np.float32)
+        np.matmul(moved, linear, out=costs)
+        np.add(costs, constant, out=costs)
+        np.add(costs, np.einsum("cnx,cnx->cn", moved, moved)[..., None], out=costs)
+        to_target, to_source = costs.min(axis=2), costs.min(axis=1)
+        return costs.argmin(axis=2), costs.argmin(axis=1), to_target, to_source, to_source < OWN_REACH_M**2
+
+    every_source, every_target = (
+        np.broadcast_to(points, (len(motions), *points.shape)) for points in (source_xyz, target_xyz)
+    )
+    for reach in reaches:
+        targets, sources, to_target, to_source, own = match(motions)
+        weights = np.concatenate([np.exp(-to_target / reach**2), own * np.exp(-to_source / reach**2)], axis=1)
+        motions = fit_upright(
+            np.concatenate([every_source, source_xyz[sources]], axis=1),
+            np.concatenate([target_xyz[targets], every_target], axis=1),
+            weights + MIN_WEIGHT,
+        )
+    _, _, to_target, to_source, own = match(motions)
+    covered = (own * np.exp(-to_source / RESIDUAL_M**2)).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
+    return motions, np.sqrt(np.exp(-to_target / RESIDUAL_M**2).mean(axis=1) * covered)
 
 
-def _paint(source: Float32Array, target: Float32Array) -> Float32Array:
-    """How much the colours of ``source (N, 6)`` and ``target (M, 6)`` differ: ``(N, M)`` square metres, capped."""
+def colour_costs(source: Float32Array, target: Float32Array) -> Float32Array:
+    """Squared colour distances ``(N, M)`` of ``source (N, 6)`` and ``target (M, 6)``, capped, in square metres."""
     a, b = source[:, 3:], target[:, 3:]
-    squares = a @ (-2 * b.T)
-    squares += (b**2).sum(axis=1)
-    squares += (a**2).sum(axis=1)[:, None]
-    return np.minimum(squares, np.float32(COLOUR_CAP_M**2), out=squares)
+    squares = a @ (-2 * b.T) + (b**2).sum(axis=1) + (a**2).sum(axis=1)[:, None]
+    return np.minimum(squares, np.float32(COLOUR_CAP_M**2))
 
 
-def painted(points: FloatArray, colours: Float32Array) -> Float32Array:
-    """Points with their colours ``(N, 6)``, all in metres."""
-    return np.concatenate([points, colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
+def register_translation(pose: FloatArray, source: Float32Array, target: Float32Array) -> FloatArray:
+    """Translation ``(3,)`` by ICP of ``source (N, 6)``, at ``pose``, onto the image's ``target (M, 6)``.
 
-
-def local_shift(pose: FloatArray, patch: Float32Array, target: Float32Array) -> FloatArray:
-    """Shift ``(3,)`` that brings a ``patch (N, 6)`` of an object, at ``pose``, onto the image's nearest points.
-
-    One way only and without turning: what an even surface does not tell (how far along it) stays as it was, while
-    edges, handles and tips of an object of another size are followed.
+    One way and without rotation: along an even surface it is not determined and stays zero, while edges, handles and
+    tips of an object of another size are followed.
     """
-    moved = transform_points(pose, patch[:, :3].astype(np.float64))
+    start = transform_points(pose, source[:, :3])
     goals = target[:, :3].astype(np.float64)
-    fixed = _paint(patch, target) + (goals**2).sum(axis=1)
+    constant = colour_costs(source, target) + (goals**2).sum(axis=1)
     shift = np.zeros(3)
-    for reach in PATCH_REACH_M:
-        there = moved + shift
-        costs = fixed - 2 * there @ goals.T + (there**2).sum(axis=1)[:, None]
+    for reach in LOCAL_REACH_M:
+        moved = start + shift
+        costs = constant - 2 * moved @ goals.T + (moved**2).sum(axis=1)[:, None]
         nearest = costs.argmin(axis=1)
-        weights = np.exp(-costs[np.arange(len(moved)), nearest] / reach**2) + 1e-9
-        shift = shift + weights @ (goals[nearest] - there) / weights.sum()
+        weights = np.exp(-costs.min(axis=1) / reach**2) + 1e-9
+        shift = shift + weights @ (goals[nearest] - moved) / weights.sum()
     return shift

@@ -1,4 +1,4 @@
-"""Which K points become keypoints: shared by all images, recognisable, on a surface, and spread out."""
+"""Choice of keypoints on an object: seen and recognised in all images, with depth, and spread out."""
 
 from __future__ import annotations
 
@@ -6,67 +6,76 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
 
-from robust_instant_policy.geometry import FloatArray, lift, project, transform_points
-from robust_instant_policy.perception.depth import surface_depth
-from robust_instant_policy.perception.descriptors import IntArray
-from robust_instant_policy.perception.objects import MovingObject, View
+from robust_instant_policy.geometry import FloatArray, project, transform_points
+from robust_instant_policy.perception.depth import lift_to_surface
+from robust_instant_policy.perception.objects import RigidObject
+from robust_instant_policy.perception.view import View
 
-SEEN_M = 0.008  # distance to the surface within which a point is seen in an image
-LIFT_REACH_M = 0.02  # a surface further from where a keypoint should be is not its own
-SPREAD_WEIGHT = 0.5  # of lying in the middle of a cluster, against being seen and recognised everywhere
-CLUSTER_ROUNDS = 20
+SEEN_M = 0.008  # from the surface: greatest distance of a point that is seen in an image
+MATCH_REACH_PATCHES = 2.0  # greatest distance of a mutual nearest neighbour from its place
+CENTRE_WEIGHT = 0.5  # of the distance to the cluster's centre, against a point's score
+KMEANS_ROUNDS = 20
 
 
-def lifted(view: View, points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
-    """``points (N, 3)`` moved along their rays onto the surface that the depth image shows there.
+def select_points(thing: RigidObject, views: Sequence[View], count: int, seed: int) -> tuple[FloatArray, list[str]]:
+    """``count`` points ``(count, 3)`` of an object, metres, in the first view, and a note for each replaced one.
 
-    Also their pixels ``(N, 2)`` and the numbers of those that have no surface near them (a hole, something in
-    front), which stay where they are.
+    The object's points are clustered. Each cluster gives the point with the best sum of three shares (images in which
+    it is seen, images in which it is a mutual nearest neighbour, saliency), less its distance from the centre. A
+    point without depth in some image is replaced by the next best.
     """
-    observation = view.observation
-    pixels = project(points, observation.intrinsics, observation.camera_pose)
-    depth = surface_depth(view.cloud.depth, pixels)
-    measured = lift(pixels, np.nan_to_num(depth), observation.intrinsics, observation.camera_pose)
-    good = np.isfinite(depth) & (np.linalg.norm(measured - points, axis=1) < LIFT_REACH_M)
-    return np.where(good[:, None], measured, points), pixels, np.flatnonzero(~good)
-
-
-def select(thing: MovingObject, views: Sequence[View], count: int, seed: int) -> tuple[FloatArray, list[str]]:
-    """``count`` points ``(count, 3)`` of an object in the first view, and a line for each that had to be replaced.
-
-    The object's points are clustered for diversity; each cluster gives the one that is seen in most images, has best
-    buddies in most, is salient, and lies in the middle. A point that cannot be lifted in every image is replaced by
-    the next best.
-    """
-    points = thing.templates[0].painted[:, :3].astype(np.float64)
-    saliency = views[0].descriptors.saliency.reshape(-1)
-    pixels = project(points, views[0].observation.intrinsics, views[0].observation.camera_pose)
-    worth = (thing.residuals(views, points) < SEEN_M).mean(axis=0) + thing.buddies(views, points)
-    worth += saliency[views[0].descriptors.cells_at(pixels)]
-    unliftable = np.zeros(len(points), dtype=bool)
+    points = thing.templates[0].xyzrgb[:, :3].astype(np.float64)
+    home = views[0]
+    pixels = project(points, home.observation.intrinsics, home.observation.camera_pose)
+    seen = np.zeros(len(points))
+    has_depth = np.ones(len(points), dtype=bool)
     for view, registration in zip(views, thing.registrations, strict=True):
-        unliftable[lifted(view, transform_points(registration.pose, points))[2]] = True
+        expected = transform_points(registration.pose, points)
+        seen += cKDTree(view.points).query(expected)[0] < SEEN_M
+        has_depth &= lift_to_surface(view.observation, view.depth, expected)[2]
+    score = seen / len(views) + _mutual_matches(thing, views, points)
+    score += home.descriptors.saliency.flat[home.descriptors.cells_at(pixels)]
 
-    count_distinct = min(count, len(points))
-    centres, label = kmeans2(points, count_distinct, iter=CLUSTER_ROUNDS, minit="++", rng=np.random.default_rng(seed))
+    clusters = min(count, len(points))
+    centres, label = kmeans2(points, clusters, iter=KMEANS_ROUNDS, minit="++", rng=np.random.default_rng(seed))
     chosen: list[int] = []
     notes = []
-    for cluster in range(count_distinct):
+    for cluster in np.unique(label):
         members = np.flatnonzero(label == cluster)
-        if len(members) == 0:
-            continue
         distance = np.linalg.norm(points[members] - centres[cluster], axis=1)
-        ranked = members[np.argsort(SPREAD_WEIGHT * distance / max(distance.max(), 1e-9) - worth[members])]
-        usable = ranked[~unliftable[ranked]]
+        ranked = members[np.argsort(CENTRE_WEIGHT * distance / max(distance.max(), 1e-9) - score[members])]
+        usable = ranked[has_depth[ranked]]
         if len(usable) and usable[0] != ranked[0]:
             u, v = pixels[ranked[0]]
             notes.append(
                 f"a keypoint at pixel ({u:.0f}, {v:.0f}) has no depth in every image; the next best replaces it"
             )
         chosen.append(int((usable if len(usable) else ranked)[0]))
-    order = np.argsort(-worth, kind="stable")
-    spare = [int(i) for i in order if i not in chosen and not unliftable[i]] + chosen
-    while len(chosen) < count:  # an empty cluster, or fewer points than keypoints
-        chosen.append(spare.pop(0) if spare else chosen[0])
+    order = np.argsort(-score, kind="stable")
+    spare = [int(i) for i in order if i not in chosen and has_depth[i]] + chosen
+    missing = count - len(chosen)  # after an empty cluster, or with fewer points than keypoints
+    chosen += (spare + [chosen[0]] * missing)[:missing]
     return points[chosen], notes
+
+
+def _mutual_matches(thing: RigidObject, views: Sequence[View], points: FloatArray) -> FloatArray:
+    """Share ``(N,)`` of the other views in which the descriptors at ``points (N, 3)`` have a mutual nearest neighbour
+    near their place ("best buddies", Amir et al. 2022).
+    """
+    if len(views) == 1:
+        return np.ones(len(points))
+    home = views[0]
+    cells = home.cells[: len(home.cell_points)]
+    patch_m = home.descriptors.step.mean() * np.nanmedian(home.depth) / home.observation.intrinsics[0, 0]
+    reach = MATCH_REACH_PATCHES * patch_m
+    votes = np.zeros(len(cells))
+    for view, registration in zip(views[1:], thing.registrations[1:], strict=True):
+        similar = home.descriptors.similarities(cells, view.descriptors, view.cells[: len(view.cell_points)])
+        match = similar.argmax(axis=1)
+        back = similar.argmax(axis=0)[match]
+        mutual = np.linalg.norm(home.cell_points[back] - home.cell_points, axis=1) < reach
+        expected = transform_points(registration.pose, home.cell_points)
+        votes += mutual & (np.linalg.norm(view.cell_points[match] - expected, axis=1) < reach)
+    return votes[cKDTree(home.cell_points).query(points)[1]] / (len(views) - 1)

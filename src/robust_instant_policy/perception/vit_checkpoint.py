@@ -1,30 +1,27 @@
-"""Vision transformers by `transformers`: from the hub, a folder or a safetensors file. Only tensors are read."""
+"""Vision transformers of `transformers`, from the hub, a folder or a safetensors file. Only tensors are read."""
 
 from __future__ import annotations
 
-import json
+import importlib.util
 import math
-import os
-import urllib.error
-import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robust_instant_policy.errors import MissingExtraError, ModelError
+from robust_instant_policy.errors import DatasetError, MissingExtraError, ModelError
+from robust_instant_policy.files import excerpt, read_json
+from robust_instant_policy.perception.settings import IMAGENET_DEVIATION, IMAGENET_MEAN
 
 HUB_TIMEOUT_S = 3.0
 WEIGHT_FILES = ("model.safetensors", "model.safetensors.index.json", "pytorch_model.bin")
-HEAD_DIM = 64  # of every DINO and DINOv2 model; used where a file of weights comes without a config.json
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
+HEAD_DIM = 64  # of every DINO and DINOv2 model; for weights without a config.json
 SUPPORTED = ("vit", "dinov2", "dinov2_with_registers")
-LISTED_TENSORS = 6  # in an error message
+MAX_LISTED_TENSORS = 6  # in an error message
 
 
 @dataclass(frozen=True, eq=False)
 class VitCheckpoint:
-    """A frozen model of `transformers`, with the mean and deviation ``(3,)`` of the colours that it was trained on."""
+    """A frozen ``model`` of `transformers`; ``mean`` and ``deviation (3,)`` of the colours it was trained on."""
 
     model: Any
     mean: tuple[float, ...] = IMAGENET_MEAN
@@ -34,9 +31,12 @@ class VitCheckpoint:
 def load_checkpoint(source: str) -> VitCheckpoint:
     """The model at ``source``: a folder, a ``.safetensors`` file, or a name on the hub (``owner/model``).
 
-    A name may end in ``@revision``, a commit of the hub's repository. The hub's local cache is asked first; without a
-    connection the answer comes within seconds. Raises `ModelError`, one line.
+    A name may end in ``@revision``, a commit of the hub's repository. The local cache goes before the hub; without a
+    connection the error comes within seconds. Raises `ModelError`, one line, and `MissingExtraError`.
     """
+    for package in ("torch", "transformers", "safetensors"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingExtraError(package, "vision")
     path = Path(source).expanduser()
     if path.is_dir():
         return _from_folder(path)
@@ -48,59 +48,37 @@ def load_checkpoint(source: str) -> VitCheckpoint:
 
 
 def cached_folder(name: str) -> Path | None:
-    """The folder in the hub's local cache that holds the weights of ``name``, without asking the network."""
+    """The folder with the weights of ``name`` in the hub's local cache, without a request to the hub."""
     try:
         from huggingface_hub import try_to_load_from_cache
-    except ImportError as error:
-        raise MissingExtraError("transformers", "vision") from error
+    except ImportError:
+        return None
     repository, _, revision = name.partition("@")
-    for file in WEIGHT_FILES:
-        found = try_to_load_from_cache(repository, file, revision=revision or None)
-        if isinstance(found, str) and (Path(found).parent / "config.json").exists():
-            return Path(found).parent
-    return None
+    paths = (try_to_load_from_cache(repository, file, revision=revision or None) for file in WEIGHT_FILES)
+    folders = (Path(path).parent for path in paths if isinstance(path, str))
+    return next((folder for folder in folders if (folder / "config.json").exists()), None)
 
 
 def _download(name: str) -> Path:
-    from huggingface_hub import constants, snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError
+    from huggingface_hub import HfApi
+    from huggingface_hub.errors import HfHubHTTPError
 
-    if os.environ.get("HF_HUB_OFFLINE") == "1":
-        raise ModelError(
-            f"the weights of {name} are not in the local cache, and HF_HUB_OFFLINE=1 forbids fetching them"
-        )
-    unreachable = ModelError(
-        f"the weights of {name} are not in the local cache and the hub cannot be reached; "
-        "copy them here and pass the folder, or use features='efficientnet'"
-    )
-    if not _reachable(constants.ENDPOINT):  # the hub's own client would try for half a minute
-        raise unreachable
-    repository, _, revision = name.partition("@")
+    repository, _, commit = name.partition("@")
+    hub, revision = HfApi(), commit or None
     try:
-        # The safetensors alone where there are any; DINO's own repositories hold a .bin, which is read as tensors only.
-        for patterns in (["*.json", "*.safetensors"], ["pytorch_model.bin"]):
-            folder = Path(
-                snapshot_download(
-                    repository, revision=revision or None, allow_patterns=patterns, etag_timeout=HUB_TIMEOUT_S
-                )
-            )
-            if any((folder / file).exists() for file in WEIGHT_FILES):
-                return folder
-    except LocalEntryNotFoundError as error:
-        raise unreachable from error
+        # This request has a short timeout; without a connection, a download would retry for half a minute.
+        files = hub.model_info(repository, revision=revision, timeout=HUB_TIMEOUT_S).siblings or ()
+        # DINO's own repositories hold only a .bin, of which transformers reads only tensors.
+        tensors = any(file.rfilename.endswith(".safetensors") for file in files)
+        wanted = ["*.json", "*.safetensors" if tensors else "pytorch_model.bin"]
+        return Path(hub.snapshot_download(repository, revision=revision, allow_patterns=wanted))
     except HfHubHTTPError as error:
-        raise ModelError(f"the hub refuses {name}: {str(error).splitlines()[0]}") from error
-    raise ModelError(f"{name} on the hub has none of {', '.join(WEIGHT_FILES)}")
-
-
-def _reachable(address: str) -> bool:
-    try:
-        urllib.request.urlopen(urllib.request.Request(address, method="HEAD"), timeout=HUB_TIMEOUT_S).close()
-    except urllib.error.HTTPError:
-        return True
-    except (OSError, ValueError):
-        return False
-    return True
+        raise ModelError(f"the hub refuses {name}: {excerpt(error)}") from error
+    except Exception as error:  # whose type depends on the hub's client
+        raise ModelError(
+            f"the weights of {name} are not in the local cache and the hub cannot provide them ({excerpt(error)}); "
+            "copy them here and pass the folder, or use features='efficientnet'"
+        ) from error
 
 
 def _from_folder(folder: Path) -> VitCheckpoint:
@@ -108,33 +86,34 @@ def _from_folder(folder: Path) -> VitCheckpoint:
         raise ModelError(f"{folder} has none of {', '.join(WEIGHT_FILES)}")
     if not (folder / "config.json").exists() and (folder / WEIGHT_FILES[0]).exists():
         return _from_file(folder / WEIGHT_FILES[0])
-    model_type = _json(folder / "config.json").get("model_type")
+    preprocessor = folder / "preprocessor_config.json"
+    try:
+        model_type = read_json(folder / "config.json").get("model_type")
+        colours = read_json(preprocessor) if preprocessor.exists() else {}
+    except DatasetError as error:
+        raise ModelError(str(error)) from error
     if model_type not in SUPPORTED:
         raise ModelError(f"{folder} holds a {model_type!r} model; supported: {', '.join(SUPPORTED)}")
-    colours = folder / "preprocessor_config.json"
-    told = _json(colours) if colours.exists() else {}
     return VitCheckpoint(
         _load(folder),
-        tuple(told.get("image_mean", IMAGENET_MEAN)),
-        tuple(told.get("image_std", IMAGENET_DEVIATION)),
+        tuple(colours.get("image_mean", IMAGENET_MEAN)),
+        tuple(colours.get("image_std", IMAGENET_DEVIATION)),
     )
 
 
 def _from_file(path: Path) -> VitCheckpoint:
-    """A model from a lone file: its configuration is derived from the names and shapes of the tensors."""
+    """A model whose configuration is derived from the names and shapes of its tensors."""
     if path.suffix != ".safetensors":
         raise ModelError(f"{path} is not a .safetensors file; give one, or a folder that transformers saved")
-    try:
-        import transformers
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-    except ImportError as error:
-        raise MissingExtraError(error.name or "transformers", "vision") from error
+    import transformers
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
     try:
         tensors = load_file(path)
     except (SafetensorError, OSError) as error:
-        raise ModelError(f"{path} cannot be read as weights: {str(error).splitlines()[0]}") from error
-    # A model saved with its classifier keeps the transformer under a name of its own.
+        raise ModelError(f"{path} cannot be read as weights: {excerpt(error)}") from error
+    # In a model saved with its classifier the transformer's tensors have a prefix.
     tensors = {name.removeprefix("vit.").removeprefix("dinov2."): tensor for name, tensor in tensors.items()}
     try:
         projection = tensors["embeddings.patch_embeddings.projection.weight"]
@@ -149,11 +128,10 @@ def _from_file(path: Path) -> VitCheckpoint:
         "patch_size": patch,
         "image_size": math.isqrt(positions.shape[1] - 1) * patch,
     }
-    dinov2 = "encoder.layer.0.layer_scale1.lambda1" in tensors
     registers = tensors.get("embeddings.register_tokens")
     if registers is not None:
         config = transformers.Dinov2WithRegistersConfig(**sizes, num_register_tokens=registers.shape[1])
-    elif dinov2:
+    elif "encoder.layer.0.layer_scale1.lambda1" in tensors:
         config = transformers.Dinov2Config(**sizes, use_swiglu_ffn="encoder.layer.0.mlp.weights_in.weight" in tensors)
     else:
         inner = tensors.get("encoder.layer.0.intermediate.dense.weight", projection.new_empty(4 * width)).shape[0]
@@ -162,14 +140,12 @@ def _from_file(path: Path) -> VitCheckpoint:
 
 
 def _load(path: Path, config: Any = None, tensors: dict[str, Any] | None = None) -> Any:
-    """The frozen model; raises `ModelError` naming the tensors that are missing or of another shape."""
-    try:
-        import torch
-        import transformers
-    except ImportError as error:
-        raise MissingExtraError(error.name or "transformers", "vision") from error
+    """The frozen model. Raises `ModelError` with the names of tensors that are missing or of another shape."""
+    import torch
+    import transformers
+
     level = transformers.logging.get_verbosity()
-    transformers.logging.set_verbosity_error()  # what does not fit is an error here, below
+    transformers.logging.set_verbosity_error()  # what it would warn of is an error below
     bars = transformers.utils.logging.is_progress_bar_enabled()
     transformers.utils.logging.disable_progress_bar()
     config = transformers.AutoConfig.from_pretrained(path) if config is None else config
@@ -187,32 +163,22 @@ def _load(path: Path, config: Any = None, tensors: dict[str, Any] | None = None)
             dtype=torch.float32,
             **pooler,
         )
-    except Exception as error:  # of many kinds, for a file that is broken or unfinished
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
-        raise ModelError(f"{path} cannot be read as weights; is it whole? ({reason})") from error
+    except Exception as error:  # transformers raises many types for broken or incomplete files
+        raise ModelError(
+            f"{path} cannot be read as weights; is it whole? ({excerpt(error) or type(error).__name__})"
+        ) from error
     finally:
         transformers.logging.set_verbosity(level)
         if bars:
             transformers.utils.logging.enable_progress_bar()
     wrong = [f"{name} is missing" for name in sorted(report["missing_keys"])]
-    for key in report["mismatched_keys"]:  # `transformers` 4 tells names, 5 the shapes as well
-        if isinstance(key, str):
-            wrong.append(f"{key} has another shape")
-        else:
-            wrong.append(f"{key[0]} is {tuple(key[1])} instead of {tuple(key[2])}")
+    wrong += [  # names in transformers 4, with shapes in 5
+        f"{key} has another shape"
+        if isinstance(key, str)
+        else f"{key[0]} is {tuple(key[1])} instead of {tuple(key[2])}"
+        for key in report["mismatched_keys"]
+    ]
     if wrong:
-        more = f" and {len(wrong) - LISTED_TENSORS} more" if len(wrong) > LISTED_TENSORS else ""
-        raise ModelError(f"the checkpoint {path} does not fit: {'; '.join(wrong[:LISTED_TENSORS])}{more}")
+        more = f" and {len(wrong) - MAX_LISTED_TENSORS} more" if len(wrong) > MAX_LISTED_TENSORS else ""
+        raise ModelError(f"the checkpoint {path} does not fit: {'; '.join(wrong[:MAX_LISTED_TENSORS])}{more}")
     return model.eval().requires_grad_(False)
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ModelError(f"{path} is missing; copy all of the model's files") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise ModelError(f"{path} cannot be read: {error}") from error
-    if not isinstance(content, dict):
-        raise ModelError(f"{path} holds no map of settings")
-    return content

@@ -1,10 +1,11 @@
 """The confidence of a plan: a calibrated probability that it is right.
 
-    P(right) = sigmoid(b_0 + Σ_j b_j f_j),   f_j <= 0, and 0 where nothing speaks against the plan
+    P(right) = min(1, agreement / GOOD_AGREEMENT) · sigmoid(b_0 + Σ_j b_j f_j),   f_j <= 0
 
-The features f_j are made from `Evidence`; the coefficients were fitted to plans for sound and for faulty scenes, all
-executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A plan that breaks a check has confidence 0;
-where demonstrations cannot tell how well they predict a new scene it is at most `UNKNOWN`.
+The features f_j are made from `Evidence` and are 0 where nothing speaks against the plan; the coefficients were fitted
+to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A
+plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene it is at
+most `UNKNOWN`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity import Finding, errors
 
-COEFFICIENTS = {"constant": 3.0, "agreement": 1.0, "keypoints": 1.0, "prediction": 1.0, "novelty": 1.0, "warnings": 1.0}
+COEFFICIENTS = {"constant": 4.9, "keypoints": 1.1, "prediction": 0.8, "novelty": 0.75, "warnings": 0.9}
 UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
 
 UNKNOWN_NOTE = (
@@ -28,7 +29,8 @@ UNKNOWN_NOTE = (
 RECOGNISED = 0.5  # confidence of keypoints from which on a scene counts as recognised; 0.7 to 0.8 is usual
 GOOD_KEYPOINTS = 0.8  # above which more says nothing
 GOOD_PREDICTION_M = 0.010  # below which demonstrations predict each other as well as keypoints are measured
-LEAST_AGREEMENT = 1e-3
+GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
+LEAST = 1e-3  # of a ratio whose logarithm is taken
 LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one scene
 
 
@@ -77,8 +79,7 @@ class Evidence:
         """f_j by name; 0 for what is not known."""
         known = self.is_known
         return {
-            "agreement": float(np.log(np.clip(self.agreement, LEAST_AGREEMENT, 1.0))),
-            "keypoints": float(np.log(np.clip(self.keypoints / GOOD_KEYPOINTS, LEAST_AGREEMENT, 1.0))),
+            "keypoints": float(np.log(np.clip(self.keypoints / GOOD_KEYPOINTS, LEAST, 1.0))),
             "prediction": -float(np.log(max(self.prediction / GOOD_PREDICTION_M, 1.0))) if known else 0.0,
             "novelty": -float(np.log(max(self.novelty, 1.0))) if known else 0.0,
             "warnings": -float(self.warnings),
@@ -90,7 +91,7 @@ def plan_confidence(evidence: Evidence) -> float:
     if evidence.errors:
         return 0.0
     score = COEFFICIENTS["constant"] + sum(COEFFICIENTS[name] * value for name, value in evidence.features().items())
-    probability = float(1 / (1 + np.exp(-score)))
+    probability = float(min(1.0, evidence.agreement / GOOD_AGREEMENT) / (1 + np.exp(-score)))
     return probability if evidence.is_known else min(probability, UNKNOWN)
 
 
