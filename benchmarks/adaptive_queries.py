@@ -1,12 +1,12 @@
-"""Adaptive Q beside fixed Q: how often the plan is right, and what it costs.
+"""Adaptive and fixed Q: share of correct plans, and their cost.
 
-    python benchmarks/adaptive_queries.py                           # made-up scenes, embedded model; docs/tables/
-    python benchmarks/adaptive_queries.py --run runs/simulation     # and the executions of `rip eval` beside them
+    python benchmarks/adaptive_queries.py                           # simulated keypoints, embedded model; docs/tables/
+    python benchmarks/adaptive_queries.py --run runs/simulation     # also the executions of `rip eval`
 
-Made-up scenes (`pick_and_place.py`): ten samples each are kept in `runs/adaptive_queries.sqlite` and asked for once.
-Some are then replaced by hallucinations, the same answer read in the scene of a demonstration, another one for each,
-so that a whole candidate goes to wrong places. Adaptive starts from three and adds one as long as the plan is not
-confident enough, ten at most. A run of `rip eval` must hold the methods `rip` and `rip-adaptive`.
+Scenes with simulated keypoints (`pick_and_place.py`): ten samples each are stored in `runs/adaptive_queries.sqlite`.
+Some are then replaced by hallucinations: the same answer, decoded in the scene of a demonstration, a different one for
+each, so that the whole candidate is wrong. Adaptive Q starts with three samples and adds one while the agreement is too
+low, ten at most. A run of `rip eval` must hold the methods `rip` and `rip-adaptive`.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from robust_instant_policy.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[1]
 STORE, TABLE = ROOT / "runs" / "adaptive_queries.sqlite", ROOT / "docs" / "tables" / "adaptive_queries.md"
-MOST = 10  # samples a scene
+MOST = 10  # samples per scene
 TEMPERATURE = 0.7
 SHARES = (0.0, 0.2, 0.4)  # of the candidates that are hallucinated
-DRAWS = 10  # of which candidates those are, for each scene
+DRAWS = 10  # of the hallucinated candidates, per scene
 THRESHOLDS = tuple(sorted({0.2, 0.3, 0.4, 0.6, 0.8, ENOUGH_AGREEMENT}))
 
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """A scene, its candidates, the same answers read in another scene, and what each further candidate costs."""
+    """A scene, its candidates, the same answers decoded in another scene, and the cost of each further candidate."""
 
     scene: Scene
     candidates: Sequence[Trajectory]
     elsewhere: Sequence[Trajectory]
     tokens: Sequence[int]
-    bends: np.ndarray
+    curvature: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ def sampled(scenes: int) -> list[Sampled]:
     return result
 
 
-def planned(scene: Scene, candidates: Sequence[Trajectory], bends: np.ndarray) -> Planned:
-    robust = robust_gripper_trajectory([candidate.actions for candidate in candidates], curvature=bends)
+def planned(scene: Scene, candidates: Sequence[Trajectory], curvature: np.ndarray) -> Planned:
+    robust = robust_gripper_trajectory([candidate.actions for candidate in candidates], curvature=curvature)
     return Planned(key_error(Trajectory.from_actions(robust.actions), scene.trajectory), robust.confidence)
 
 
@@ -108,7 +108,7 @@ def made_up(scenes: int) -> list[Line]:
                 wrong = np.random.default_rng([number, draw]).random(len(one.candidates)) < share
                 mixed = [e if w else c for c, e, w in zip(one.candidates, one.elsewhere, wrong, strict=True)]
                 plans = {
-                    count: planned(one.scene, mixed[:count], one.bends) for count in range(FIRST_QUERIES, MOST + 1)
+                    count: planned(one.scene, mixed[:count], one.curvature) for count in range(FIRST_QUERIES, MOST + 1)
                 }
                 cases.append((one, plans))
 
@@ -139,7 +139,7 @@ def made_up(scenes: int) -> list[Line]:
 
 
 def executed(folder: Path) -> list[str]:
-    """Success and tokens of the two methods over the scenes that both were executed in."""
+    """Success and tokens of the two methods over the scenes in which both were executed."""
     columns = ["task", "objects", "seed", "method", "success", "tokens"]
     rows = pq.read_table(folder / "episodes.parquet", columns=columns).to_pylist()
     by_task: dict[str, dict[str, dict[tuple[str, int], dict]]] = defaultdict(lambda: defaultdict(dict))
@@ -155,7 +155,7 @@ def executed(folder: Path) -> list[str]:
         both = sorted(fixed.keys() & adaptive.keys())
         if not both:
             continue
-        # Both go over the same samples, so whoever read and wrote less asked for fewer.
+        # Both use the same samples, so fewer tokens mean fewer samples.
         fewer = np.mean([adaptive[scene]["tokens"] < fixed[scene]["tokens"] for scene in both])
         lines.append(
             f"| {task} | {len(both)} "
@@ -172,7 +172,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="folder of a `rip eval` with rip and rip-adaptive")
     args = parser.parse_args()
     text = (
-        f"Made-up scenes, embedded model at temperature {TEMPERATURE:g}, {args.scenes} scenes, "
+        f"Simulated keypoints, embedded model at temperature {TEMPERATURE:g}, {args.scenes} scenes, "
         f"{DRAWS} draws of the hallucinations in each.\n\n"
         f"| hallucinated | asked | within {1000 * WITHIN_M:.0f} mm | queries a plan | plans with more than "
         f"{FIRST_QUERIES} | tokens a plan |\n| --- | --- | --- | --- | --- | --- |\n"

@@ -1,9 +1,9 @@
-"""What baselines reach and what they cost: success, seconds of training, seconds of planning, from runs of `rip eval`.
+"""Success, training time and planning time of the baselines, from runs of `rip eval`.
 
 rip eval --methods kat-dp --demos 200 --episodes 20 --out runs/proof    (and the like)
 python benchmarks/baselines.py results/paper runs/proof --checkpoints checkpoints --table docs/tables/baselines.md
 
-What trainings took is kept in `results/baselines/training.json`, so that checkpoints need not be.
+Training times are stored in `results/baselines/training.json`, so that checkpoints can be deleted.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ NAME = re.compile(r"(?P<method>kat-dp|dp)-(?P<task>.+)-(?P<demos>\d+)-[0-9a-f]+"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders that rip eval wrote")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders written by rip eval")
     parser.add_argument("--checkpoints", type=Path, default=Path("checkpoints"))
     parser.add_argument("--table", type=Path, required=True)
     options = parser.parse_args()
-    rows: dict[tuple, dict[EpisodeKey, Episode]] = defaultdict(dict)  # what two runs did counts once
+    rows: dict[tuple, dict[EpisodeKey, Episode]] = defaultdict(dict)  # rows of two runs count once
     for run in options.runs:
         for row in read_results(run).episodes:
             if row.variant.steps is None and (row.variant.method not in UNTRAINED or row.variant.demos != DEMOS):
@@ -56,12 +56,12 @@ def main() -> None:
 
 
 def place(task: str, demos: int, method: str, steps: int | None) -> tuple:
-    """In the table: by task and demonstrations, methods as in other tables."""
+    """Order in the table: by task and demonstrations, methods as in other tables."""
     return task, demos, METHOD_NAMES.index(method), steps or 0
 
 
 def training_seconds(folder: Path) -> dict[tuple[str, str, int, int], float]:
-    """Of every finished checkpoint in ``folder`` or before: method, task, demonstrations and steps to seconds."""
+    """Seconds by method, task, demonstrations and steps, of finished checkpoints in ``folder`` and of stored times."""
     seconds = {tuple(key): value for key, value in json.loads(KEPT.read_text())} if KEPT.exists() else {}
     for path in folder.glob("*.safetensors"):
         name = NAME.fullmatch(path.stem)

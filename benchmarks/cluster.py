@@ -1,10 +1,10 @@
-"""An evaluation on a local Ray cluster of two nodes, one of which is killed half-way: the run ends complete.
+"""An evaluation on a local Ray cluster of two nodes, one of which is killed half-way; the run must be complete.
 
 python benchmarks/cluster.py --data data --out runs/cluster [--samples runs/paper/samples.sqlite] [--table FILE]
 
-Each node is a raylet of its own with one core, as on another machine. The same scenes are done once more by two
-processes on this machine, and the rows are compared: they must be equal up to order and times. Without --samples only
-the method that needs no language model is run.
+Each node is a separate raylet with one core, as on another machine. Two processes on this machine execute the same
+scenes again; the rows must be equal up to order and times. Without --samples only the method without a language model
+is executed.
 """
 
 from __future__ import annotations

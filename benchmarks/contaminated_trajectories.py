@@ -1,6 +1,6 @@
-"""Seeded gripper trajectories with hallucinated candidates among them, and the truth they are to be measured against.
+"""Seeded gripper trajectories with hallucinated candidates, and their ground truth.
 
-A scene is one task at new places of its objects: a truth, Q candidates around it, and which of them are hallucinated.
+A scene is one task with new object positions: a true trajectory, Q candidates, and the set of hallucinated ones.
 Trajectories are functions of normalised time, so that candidates of different lengths sample the same motion.
 """
 
@@ -18,10 +18,10 @@ from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pos
 
 STEPS = 30
 GRIPPER = GripperTriangle(length=0.10, opening=0.08)
-NUMBER_NOISE_M = 0.002  # of every number by itself: what a model that writes millimetres gets wrong
-STEP_NOISE_M, STEP_NOISE_RAD = 0.0015, 0.01  # of the whole gripper, step by step
-SLOW_NOISE_M = 0.001  # of the whole candidate, wandering along it
-NOTICEABLE_M = 0.015  # a contamination that moves no point this far is drawn again: nobody would call it hallucinated
+NUMBER_NOISE_M = 0.002  # independent noise of every number
+STEP_NOISE_M, STEP_NOISE_RAD = 0.0015, 0.01  # independent noise of the gripper at each step
+SLOW_NOISE_M = 0.001  # slowly varying noise along the candidate
+NOTICEABLE_M = 0.015  # smaller contaminations are drawn again: they are within the noise
 DETOUR_M = (0.06, 0.20)  # between neighbouring ways of a task that can be done in several
 RAGGED_SHARE = 0.25  # of the scenes, whose candidates have 27 to 33 steps instead of 30
 
@@ -43,12 +43,12 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Via points relative to two objects, so that the same task can be done at other places of them."""
+    """Via points relative to two objects, so that the task can be executed at other object positions."""
 
     style: str
     times: FloatArray
     offsets: FloatArray
-    owner: np.ndarray  # which object (0, 1) a via point moves with; 2 is the world
+    owner: np.ndarray  # frame of each via point: object 0 or 1; 2 is the world
     yaw: FloatArray
     tilt: FloatArray
     closes: float
@@ -86,7 +86,7 @@ class Task:
         return cls(style, times, offsets, owner, yaw, tilt, closes=times[2] + 0.5 / STEPS, opens=times[6] + 0.5 / STEPS)
 
     def at(self, objects: FloatArray, turn: float = 0.0) -> Motion:
-        """The motion for objects at ``objects (2, 3)``, metres, the gripper turned by ``turn`` radians."""
+        """The motion for objects at ``objects (2, 3)``, metres, the gripper rotated by ``turn`` radians."""
         points = self.offsets + np.vstack([objects, np.zeros(3)])[self.owner]
         via = np.column_stack([points, self.yaw + turn, self.tilt])
 
@@ -124,7 +124,7 @@ def _noisy(rng: np.random.Generator, actions: FloatArray, level: float) -> Float
     points = points + (rng.normal(0, STEP_NOISE_M * level, (count, 3)) + slow)[:, None]
     noisy[:, :9] = points.reshape(count, 9) + rng.normal(0, NUMBER_NOISE_M * level, (count, 9))
     noisy[:, :9] = np.round(noisy[:, :9], 3)
-    if rng.random() < 0.3:  # the gripper a step early or late
+    if rng.random() < 0.3:  # gripper changes one step early or late
         change = rng.choice(np.flatnonzero(np.diff(actions[:, 9]))) if np.diff(actions[:, 9]).any() else 0
         noisy[change : change + 2, 9] = actions[change + rng.integers(2), 9]
     return noisy
@@ -191,14 +191,14 @@ KINDS = {
 
 
 def draw_modes(seed: int, style: str, sizes: tuple[int, ...]) -> Scene:
-    """A scene with ``sizes`` candidates in each of several good ways, which part and meet again; `Scene.truth` is the
-    way of the first and largest, ``modes`` the way of each candidate."""
+    """A scene with ``sizes`` candidates in several modes, which diverge and meet again; `Scene.truth` is the first and
+    largest mode, ``modes`` the mode of each candidate."""
     rng = np.random.default_rng([seed, *sizes, len(style)])
     task = Task.draw(rng, style)
     common = task.at(_objects(rng))
     start, stop = rng.uniform(0.1, 0.3), rng.uniform(0.6, 0.9)
     around = rng.uniform(0, 2 * np.pi) + np.arange(len(sizes)) * 2 * np.pi / len(sizes)
-    detour = rng.uniform(*DETOUR_M) / (2 * np.sin(np.pi / max(len(sizes), 2)))  # neighbouring ways are this far apart
+    detour = rng.uniform(*DETOUR_M) / (2 * np.sin(np.pi / max(len(sizes), 2)))  # distance of neighbouring modes
     level = float(np.exp(rng.normal(0, 0.5)))
     truths = [_detour(common, start, stop, [detour * np.cos(a), 0.0, detour * np.sin(a)], style) for a in around]
     if len(sizes) == 1:

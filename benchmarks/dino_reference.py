@@ -1,12 +1,11 @@
-"""Are the descriptors the same numbers as the public reference's?
+"""Compares the descriptors with those of the public reference implementation.
 
     git clone https://github.com/ShirAmir/dino-vit-features
     python benchmarks/dino_reference.py dino-vit-features
 
-Loads one random ViT-S/8 into both, describes one image with both at each column of the paper's parameter table, and
-prints the largest differences, also into `docs/tables/dino_reference.md`. The reference needs timm and torchvision
-only to fetch weights and read files, which is not done here, so empty stand-ins take their place where they are not
-installed.
+Loads one random ViT-S/8 into both, describes one image with both for each column of the paper's Table II, and
+writes the largest differences to the terminal and to `docs/tables/dino_reference.md`. The reference needs timm and
+torchvision only to download weights and read files, so empty modules replace them where they are not installed.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ def random_checkpoint(seed: int, config: transformers.ViTConfig = VIT_S8) -> Vit
 
 
 class ReferenceAttention(nn.Module):
-    """Attention with the names that the reference hooks into."""
+    """Attention with the module names that the reference hooks."""
 
     def __init__(self, width: int, heads: int):
         super().__init__()

@@ -1,10 +1,10 @@
-"""How fast an evaluation runs when its samples are replayed, where the time goes, and what a second worker brings.
+"""Speed of an evaluation with stored samples: time per part, and the gain of a second worker.
 
 python benchmarks/evaluation.py --samples runs/speed/samples.sqlite --out docs/tables/evaluation_speed.md [--scaling]
 
-The samples must hold the scenes of `rip eval` for the tasks and methods measured here. Shares are of processor time, so
-that they do not depend on what else the machine does; --scaling compares one worker with two by the clock and wants a
-machine with two cores to itself.
+The samples must contain the scenes of `rip eval` for the measured tasks and methods. Shares are of processor time, so
+that other programs do not change them; --scaling compares the wall time of one and of two workers and needs a machine
+with two idle cores.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-# As the workers have it, or prompts differ in their last digits; before numpy is imported.
+# As in the workers, otherwise prompts may differ in their last digits; must precede the import of numpy.
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
 from robust_instant_policy.evaluation import (
@@ -71,7 +71,7 @@ def main() -> None:
 
 
 def _shares(suite: Suite, setup: Setup) -> list[str]:
-    """One worker, its parts timed; what comes before the second scene of a task (simulator, fitting) is left out."""
+    """One worker with timed parts; the time before the second scene of a task (simulator, fitting) is excluded."""
     lines = [
         f"| task | executions | in a minute of a core | {' | '.join(PARTS)} | rest |",
         f"| --- | --- | --- | {' | '.join('---' for _ in PARTS)} | --- |",
@@ -98,7 +98,7 @@ def _is_episode(outcome: object) -> bool:
 
 
 def _time_parts(bench: Workbench, spent: dict[str, float]) -> Callable[[], None]:
-    """Have the parts of `bench` add what they take to ``spent``; returns what undoes it."""
+    """Make the parts of `bench` add their time to ``spent``; returns a function that undoes it."""
     task: Any = bench._task
     cell = next(value for value in vars(task).values() if hasattr(value, "photograph"))
     undo = []
@@ -125,7 +125,7 @@ def _time_parts(bench: Workbench, spent: dict[str, float]) -> Callable[[], None]
 
 
 def _scaling(suite: Suite, setup: Setup, folder: Path) -> list[str]:
-    """The whole suite by one worker, by two, by two, by one, so that a machine that slows down treats both alike."""
+    """The whole suite with 1, 2, 2 and 1 workers, so that a drift of the machine's speed affects both equally."""
     lines = ["| workers | executions | seconds | a minute, from the first row on |", "| --- | --- | --- | --- |"]
     rates: dict[int, list[float]] = {1: [], 2: []}
     for turn, workers in enumerate((1, 2, 2, 1)):

@@ -389,7 +389,7 @@ def spin(degrees: float) -> Callable[[FloatArray], FloatArray]:
 
 
 def about_the_fingertips(own: FloatArray) -> FloatArray:
-    """The palm below the fingertips."""
+    """The gripper point below the fingertips."""
     return 2 * own[..., 1:, :].mean(axis=-2, keepdims=True) - own
 
 

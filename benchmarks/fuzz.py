@@ -1,7 +1,7 @@
-"""Fuzz everything that reads from outside: python benchmarks/fuzz.py [--cases N] [--targets NAME …] [--seed N].
+"""Fuzz all readers of external data: python benchmarks/fuzz.py [--cases N] [--targets NAME …] [--seed N].
 
-The targets are those of ``tests/fuzz_targets.py``, which the tests run with fewer cases. A case that fails is made as
-small as possible and kept in ``tests/fuzz_corpus/``, where the tests run it again. Writes ``docs/tables/fuzz.md`` when
+The targets are those of ``tests/fuzz_targets.py``, which the tests run with fewer cases. A failing case is
+minimised and stored in ``tests/fuzz_corpus/``, where the tests run it again. Writes ``docs/tables/fuzz.md`` when
 all targets were run.
 """
 

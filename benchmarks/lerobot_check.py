@@ -1,11 +1,11 @@
-"""Does the real `lerobot` read our demonstrations folders, and see in them what we see? And do we read its?
+"""Compares `lerobot` and this package: both read our folders, and this package imports a dataset of `lerobot`.
 
     python benchmarks/lerobot_check.py [--demos DIR] [--venv VENV]
 
-`lerobot` wants another torch than ours, so it lives in an environment of its own, made at VENV if it is not there
-(8 GB, with its CUDA libraries). Every frame of the folder is read with both libraries and compared; without --demos
-a small folder is made up first. With the system's `ffmpeg` installed, lerobot decodes by torchcodec, otherwise by
-PyAV. The other way round, lerobot writes a small dataset of end-effector poses and the importer reads it. The result
+`lerobot` needs another version of torch, so it is installed in a separate environment at VENV (8 GB, with CUDA
+libraries). Every frame of the folder is read with both libraries and compared; without --demos a small folder is
+generated. With the system's `ffmpeg` installed, lerobot decodes with torchcodec, otherwise with PyAV. In the other
+direction, lerobot writes a small dataset of end-effector poses and the importer reads it. The result
 goes to docs/tables/lerobot.md.
 """
 
@@ -104,8 +104,8 @@ def main() -> None:
         rows = [check(python, demos, backend, Path(scratch) / "frames.npz") for backend in ("pyav", "torchcodec")]
         back = check_import(python, Path(scratch))
     text = (
-        table(rows, options.demos.name if options.demos else f"{EPISODES} made-up episodes")
-        + f"\nThe other way round: {back}\n"
+        table(rows, options.demos.name if options.demos else f"{EPISODES} generated episodes")
+        + f"\nIn the other direction: {back}\n"
     )
     print(text)
     TABLE.parent.mkdir(parents=True, exist_ok=True)
@@ -113,7 +113,7 @@ def main() -> None:
 
 
 def environment(folder: Path) -> Path:
-    """Interpreter of an environment with the real `lerobot`, made when it is not there."""
+    """Interpreter of an environment with `lerobot`, created if it is missing."""
     python = folder / "bin" / "python"
     if not python.exists():
         venv.create(folder, with_pip=True)
@@ -150,7 +150,7 @@ def make_up(folder: Path) -> Path:
 
 
 def check(python: Path, folder: Path, backend: str, frames: Path) -> dict[str, object]:
-    """Read ``folder`` with both libraries; a row of what was compared. Stops where they disagree."""
+    """Read ``folder`` with both libraries; a row of what was compared. Stops if they differ."""
     command = [python, "-c", READ_WITH_LEROBOT, folder.resolve(), frames, backend]
     done = subprocess.run(
         command, capture_output=True, text=True, env={"HF_HUB_OFFLINE": "1", "HOME": str(Path.home())}
@@ -184,13 +184,13 @@ def check(python: Path, folder: Path, backend: str, frames: Path) -> dict[str, o
         agree["images"] = difference <= MAX_IMAGE_DIFFERENCE
     wrong = [name for name, same in agree.items() if not same]
     if wrong:
-        sys.exit(f"{folder}: lerobot ({backend}) and we disagree about {', '.join(wrong)}")
+        sys.exit(f"{folder}: lerobot ({backend}) and this package differ in {', '.join(wrong)}")
     result = f"equal: {', '.join(agree)}"
     return {**told, "decoder": backend, "images": len(theirs["images"]), "difference": difference, "result": result}
 
 
 def check_import(python: Path, scratch: Path) -> str:
-    """Import a dataset that lerobot wrote; a sentence on what was compared. Stops where something differs."""
+    """Import a dataset that lerobot wrote; a sentence on what was compared. Stops if something differs."""
     random = np.random.default_rng(1)
     poses = np.tile(np.eye(4), (2, 40, 1, 1))
     turns = random.normal(size=(2, 40, 3)).cumsum(axis=1) * 0.02
@@ -235,7 +235,7 @@ def check_import(python: Path, scratch: Path) -> str:
 
 def table(rows: list[dict[str, object]], folder: str) -> str:
     lines = [
-        f"Written by `benchmarks/lerobot_check.py`: {folder}, read with {LEROBOT.replace('==', ' ')} and with ours.",
+        f"Written by `benchmarks/lerobot_check.py`: {folder}, read with {LEROBOT.replace('==', ' ')} and this package.",
         "",
         "| decoder | torch, torchvision | episodes | frames | images | largest mean difference of an image | result |",
         "| --- | --- | --- | --- | --- | --- | --- |",

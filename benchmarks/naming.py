@@ -1,10 +1,10 @@
-"""How well hallucinated candidates are named: those that fail when they are executed alone, and those that succeed.
+"""Accuracy of the diagnosis: share of flagged candidates among those that fail, and succeed, when executed alone.
 
     python benchmarks/naming.py --run results/paper --out docs/tables/naming.md
 
 The run is one of `rip eval --suite table1` with the methods `rip` and `kat`, its samples beside its rows: `kat`
-executes every candidate by itself. Only scenes in which `rip` succeeds count: where the keypoints are wrong, all
-candidates fail and none is the odd one out. No model is asked and nothing is executed.
+executes every candidate alone. Only scenes in which `rip` succeeds count: with wrong keypoints all candidates fail
+and none is an outlier. No model is needed and nothing is executed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NOTE = "Candidates that fail or succeed when executed alone, in scenes in which 
 
 
 def executions(run: Path, task: str, llm: str) -> tuple[set[int], dict[int, list[bool]]]:
-    """Seeds of the scenes in which `rip` succeeded, and which of each scene's candidates did by themselves."""
+    """Seeds of the scenes in which `rip` succeeded, and which candidates of each scene succeeded alone."""
     rip, kat = (Variant(name, NUM_DEMOS, NUM_QUERIES, model=model_name(llm)) for name in ("rip", "kat"))
     rows = [row for row in read_results(run).episodes if (row.scene.task, row.scene.objects) == (task, "seen")]
     good = {row.scene.seed for row in rows if row.variant == rip and row.success}

@@ -1,8 +1,8 @@
-"""Made-up scenes in which a gripper moves an object: what language models are measured on.
+"""Scenes with simulated keypoints in which a gripper moves an object, to measure language models.
 
-Two objects, each turned and placed at random, five keypoints on each, measured with noise; the gripper grasps the first
+Two objects with random position and rotation, five keypoints on each, measured with noise; the gripper grasps the first
 object in its own frame and sets it down. The error is the largest distance of any of the three gripper points from
-where it belongs, at any key step: start, both sides of the grasp and of the release, end.
+the truth at any key step: start, both sides of the grasp and of the release, end.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ TASKS = ("place", "midway")
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Measured keypoints ``(K, 3)`` and what a demonstrator does in it."""
+    """Measured keypoints ``(K, 3)`` and the demonstrated trajectory."""
 
     keypoints: FloatArray
     trajectory: Trajectory
 
 
 class PickAndPlace:
-    """Draws scenes. The objects' keypoints and the grasp are those of ``seed``.
+    """Draws scenes. The objects' keypoints and the grasp depend on ``seed``.
 
     In the task "place" the gripper sets the first object down in the frame of the second, so that each step is the
-    same in some object's frame. In "midway" it does so half-way between the two, which is the same in no frame: who
-    knows the demonstrations' median only is wrong.
+    same in some object's frame. In "midway" it does so half-way between the two, which is constant in no object's
+    frame: the median of the demonstrations is wrong.
     """
 
     def __init__(self, task: str = "place", seed: int = 0):
@@ -48,7 +48,7 @@ class PickAndPlace:
         self.place = _down(rng.uniform(-0.01, 0.01, 2), 0.05, rng.uniform(-0.5, 0.5))
 
     def scene(self, seed: int, *, exact: bool = False) -> Scene:
-        """Scene of ``seed``; ``exact`` lets the demonstrator's hand be steady (the keypoints stay noisy)."""
+        """Scene of ``seed``; ``exact`` removes the demonstrator's noise (the keypoints stay noisy)."""
         rng = np.random.default_rng([7, seed])
         while True:
             places = rng.uniform([0.35, -0.25], [0.65, 0.25], (2, 2))
@@ -112,8 +112,8 @@ def key_steps(trajectory: Trajectory) -> list[int]:
 
 
 def key_error(trajectory: Trajectory, truth: Trajectory) -> float:
-    """Largest distance of the three gripper points from the truth at any key step, metres; infinite when the
-    gripper opens and closes another number of times."""
+    """Largest distance of the three gripper points from the truth at any key step, metres; infinite if the
+    number of gripper changes differs."""
     own, true = key_steps(trajectory), key_steps(truth)
     if len(own) != len(true):
         return float("inf")

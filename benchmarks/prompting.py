@@ -1,8 +1,8 @@
-"""How well, how fast and for how many tokens a language model imitates, by frames and layout of the prompt.
+"""Accuracy, time and tokens of a language model, by frames and layout of the prompt.
 
-Ten demonstrations of a made-up task (`pick_and_place.py`), then scenes that were not shown. Every plan is kept in
-`results/prompting.jsonl` as it is made and not made again, so a run may be stopped and gone on with; the table is
-written anew from all that is kept, with the number of scenes of each row.
+Ten demonstrations of a task with simulated keypoints (`pick_and_place.py`), then new scenes. Every plan is stored in
+`results/prompting.jsonl` and not repeated, so a run can be interrupted and continued; the table is written from all
+stored plans, with the number of scenes of each row.
 
     python benchmarks/prompting.py                          # the embedded model, the paper's layout and ours
     python benchmarks/prompting.py --layouts factorised --temperatures 0.5 1.0 --tasks place midway
@@ -41,7 +41,7 @@ FIRST_NEW_SEED = 1000  # demonstrations count from 0
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table: a task and a way of asking."""
+    """One line of the table: a task, a model and a kind of prompt."""
 
     task: str
     model: str
@@ -53,11 +53,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Outcome:
-    """One plan: key-step errors in metres (infinite where nothing came) and what it cost.
+    """One plan: key-step errors in metres (infinite without an answer) and its cost.
 
-    ``tokens`` are those read (not from a cache) and written, ``paper_tokens`` those of the paper's layout for the
-    same numbers; ``cold`` says that the model had read nothing before. ``load`` is the machine's, from other work,
-    and ``peak_gib`` the memory of the whole process so far.
+    ``tokens`` are those read (not cached) and written, ``paper_tokens`` those of the paper's layout for the same
+    numbers; ``cold`` means that nothing was cached. ``load`` is the load of the machine by other programs, and
+    ``peak_gib`` the memory of the whole process so far.
     """
 
     scene: int
@@ -127,9 +127,9 @@ class Measurement:
         return outcome
 
     def _paper_tokens(self, scene: Scene) -> int:
-        """What a perfect plan would cost in the paper's layout, by this model's count of tokens."""
+        """Tokens of a correct plan in the paper's layout, counted by this model."""
         (query,) = self._paper.queries(scene.keypoints)
-        # Shown as one more demonstration, the right answer is the text between its keypoints and the end.
+        # With the truth as one more demonstration, the correct answer is the text after its keypoints.
         told = fitted([scene], "world", "sequence", "given").queries(scene.keypoints)[0].text
         keypoints = query.text.splitlines()[-1] + "\n"
         answer = told.removeprefix(keypoints).removesuffix(keypoints)
@@ -150,7 +150,7 @@ def agreed_error(candidates: Sequence[Trajectory], scene: Scene, dof: float, cur
 
 
 def loaded(spec: str) -> tuple[LanguageModel, float]:
-    """The model, ready to answer, and the seconds that took."""
+    """The model, ready to answer, and its start time in seconds."""
     start = time.monotonic()
     model = connect(spec)
     model.sample([Query("1 2 3 ", max_tokens=1)], Sampling(1, temperature=0.0))
@@ -158,7 +158,7 @@ def loaded(spec: str) -> tuple[LanguageModel, float]:
 
 
 def read_kept() -> dict[Row, dict[int, Outcome] | str]:
-    """Plans by row and scene, or the words with which a model refused the prompt."""
+    """Plans by row and scene, or the error message of a model that refused the prompt."""
     kept: dict[Row, dict[int, Outcome] | str] = {}
     for line in KEPT.read_text().splitlines() if KEPT.exists() else ():
         entry = json.loads(line)
@@ -180,7 +180,7 @@ def keep(row: Row, entry: dict[str, object]) -> None:
 
 
 def measure(row: Row, spec: str, scenes: int, deadline_s: float) -> None:
-    """Make the plans of ``row`` that are missing."""
+    """Make the missing plans of ``row``."""
     done = read_kept().get(row, {})
     missing = [number for number in range(scenes) if number not in done] if isinstance(done, dict) else []
     if not missing:
@@ -250,7 +250,7 @@ def as_cells(row: Row, plans: Sequence[Outcome]) -> list[str]:
 
 
 def reference_cells(task: str, scenes: int) -> list[str]:
-    """What the frames give without any model: every number the demonstrations' median."""
+    """The frames without a model: every number is the median of the demonstrations."""
     world = PickAndPlace(task)
     prompt = fitted([world.scene(seed) for seed in range(NUM_DEMOS)], "adaptive", "factorised", "given")
     new = [world.scene(FIRST_NEW_SEED + number, exact=True) for number in range(scenes)]

@@ -31,8 +31,8 @@ from robust_instant_policy.regression.network import RECIPES
 
 PAGE = Path(__file__).parents[1] / "docs" / "regression-benchmark.md"
 STYLES = ("smooth", "piecewise")
-SIZES = {3: 1, 5: 2, 10: 4}  # candidates, and the most of them that are hallucinated
-SCENES = 24  # of every kind for Q = 5; half as many for the others
+SIZES = {3: 1, 5: 2, 10: 4}  # number of candidates: maximum number of hallucinated ones
+SCENES = 24  # scenes of each kind for Q = 5; half as many for other Q
 CLEAN_SCENES = 100  # with no candidate hallucinated
 MODE_SCENES = 100
 NETWORK_SCENES = 2  # of every style and number of hallucinated ones: a fit takes seconds
@@ -134,7 +134,7 @@ def measure(case: Case) -> Outcome:
 
 
 def measure_modes(job: tuple[str, tuple[int, ...], int]) -> tuple[bool, bool, bool]:
-    """Whether the number of ways was found, one way followed all along, and that one of the largest."""
+    """Whether the number of modes is correct, one mode is followed throughout, and it is one of the largest."""
     style, sizes, seed = job
     scene = draw_modes(seed, style, sizes)
     mixture = StudentTMixture(groups=POINTS).fit([candidate[:, :9] for candidate in scene.candidates])
@@ -269,7 +269,7 @@ def modes_table(pool: ProcessPoolExecutor, scenes: int) -> str:
         jobs = [(style, sizes, seed) for style in STYLES for seed in range(scenes)]
         found, coherent, largest = np.mean(list(pool.map(measure_modes, jobs, chunksize=8)), axis=0)
         rows.append(["+".join(map(str, sizes)), str(len(jobs)), f"{found:.1%}", f"{coherent:.1%}", f"{largest:.1%}"])
-    header = ["candidates by way", "scenes", "number of ways found", "one coherent way", "a best supported one"]
+    header = ["candidates per mode", "scenes", "number of modes found", "one coherent mode", "a mode with most support"]
     return table(header, rows)
 
 
@@ -388,26 +388,26 @@ def main() -> None:
 PAGE_TEMPLATE = """# Regression, measured
 
 Written by `python benchmarks/regression.py` in {minutes:.1f} minutes on the machine it last ran on, from {scenes}
-scenes and more for the later tables. The scenes are those of `benchmarks/contaminated_trajectories.py`: gripper
-triplets, candidates with noise of every number, of every step and slowly along the candidate (a point of a clean
-candidate is {noise[0]:.1f} mm from the truth in the median scene, {noise[1]:.1f} and {noise[2]:.1f} mm in the quietest
-and loudest tenth), rounded to millimetres, and in a quarter of the scenes of different lengths. A hallucination moves
-some point by 15 mm at least.
+scenes, with more scenes for the later tables. The scenes are those of `benchmarks/contaminated_trajectories.py`:
+gripper triplets, candidates with noise per number, per step and slowly varying along the candidate (a point of a clean
+candidate is {noise[0]:.1f} mm from the truth in the median scene, {noise[1]:.1f} and {noise[2]:.1f} mm in the tenth
+with least and most noise), rounded to millimetres. In a quarter of the scenes the candidates have different lengths. A
+hallucination moves at least one point by 15 mm or more.
 
 ## Error against the truth
 
-Mean distance of the three gripper points, relative to that of the mean of the clean candidates, which nobody can know
-(the oracle); medians over scenes. "Goal" is what the default, `t, EM`, is to reach, ✗ where it does not. The last
-column is its error at the steps where the gripper closes or opens, again relative to the oracle's.
+Mean distance of the three gripper points to the truth, relative to that of the oracle, which is the mean of the clean
+candidates; medians over scenes. "Goal" is the limit for the default, `t, EM`; ✗ marks a missed goal. The last
+column is its error at the steps where the gripper closes or opens, relative to the oracle's.
 {errors}
 ### Networks
 
-Few scenes of mixed kinds, because each fit takes seconds. The networks are trained in the fast way.
+Fewer scenes, of mixed kinds, because each fit takes seconds. The networks use the fast recipe.
 
 {networks}
 ### Single bad steps
 
-When every step is asked for by itself, single steps of any candidate are bad, independently (here 3 to 10 cm off).
+When each step is queried separately, single steps of any candidate are wrong independently (here 3 to 10 cm off).
 Share of steps more than 15 mm from the truth, Q = 5:
 
 {single}
@@ -416,17 +416,17 @@ Share of steps more than 15 mm from the truth, Q = 5:
 {diagnosis}
 ## Intervals
 
-How often 90% intervals cover the truth, over steps and dimensions:
+Share of steps and dimensions in which the 90% interval covers the truth:
 
 {coverage}
 ## Confidence
 
-`robust_gripper_trajectory(...).confidence` against what happened:
+`robust_gripper_trajectory(...).confidence` and the measured share of correct trajectories:
 
 {confidence}
-## Several ways
+## Several modes
 
-One coherent way: at every step closer to one way than a quarter of the distance to the next one.
+One coherent mode: at every step the distance to one mode is less than a quarter of the distance to the next one.
 
 {modes}
 ## Time

@@ -1,4 +1,4 @@
-"""Draws docs/images/regression.svg: five candidates, two of them hallucinated, and what is made of them."""
+"""Draws docs/images/regression.svg: five candidates, two of them hallucinated, their mean and the robust trajectory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from robust_instant_policy.regression import StudentTRegression
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "regression.svg"
 WIDTH, HEIGHT, STRIP, MARGIN = 640.0, 260.0, 70.0, 36.0
-COLUMN = 0  # palm x
+COLUMN = 0  # gripper point, x
 COLOURS = {"clean": "#9aa5b1", "hallucinated": "#e5484d", "Gaussian": "#f0a020", "robust": "#1f6feb"}
 
 

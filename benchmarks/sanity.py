@@ -3,7 +3,7 @@
     rip record --task TASK --episodes 10 --seed 200000 --out DATA/TASK       # for every task
     python benchmarks/sanity.py DATA --seed 600003 --out results/sanity
 
-New scenes are drawn from ``--seed``. What is in ``--out`` is not measured again.
+New scenes are drawn from ``--seed``. Measurements in ``--out`` are not repeated.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""How well the demonstrators do, how well their recordings replay, and how fast it all is.
+"""Success of the demonstrators and of replayed recordings, and the speed of the simulation.
 
     python benchmarks/simulation.py [--attempts 100] [--tasks push-cube …] [--out results/simulation.md]
 
-Replays run the recording, thinned out to about 30 steps, in the scene it was recorded in. What has been measured is
-kept beside ``--out`` as .json: run again it goes on where it stopped.
+Replays execute the recording, downsampled to about 30 steps, in its scene. Measurements are stored beside ``--out`` as
+.json; an interrupted run continues.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Quality:
 class Speed:
     task: str
     reset_s: float
-    bare: float  # simulated seconds a wall second
+    bare: float  # simulated seconds per wall second
     filmed: float
     episodes_an_hour: float
     episodes_an_hour_with_images: float
@@ -67,7 +67,7 @@ def measure_quality(task: Task, objects: str, attempts: int) -> Quality:
 
 
 def measure_speed(task: Task) -> Speed:
-    task.demonstrate(0)  # the first image of a process compiles the shaders
+    task.demonstrate(0)  # the first image of a process also compiles the shaders
     started = time.perf_counter()
     trajectories = [task.demonstrate(seed).demonstration.trajectory for seed in range(TIMED_EPISODES)]
     demonstrating = time.perf_counter() - started

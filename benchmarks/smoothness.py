@@ -1,10 +1,10 @@
-"""How sharply trajectories turn: demonstrations, single samples, their Gaussian mean, and robust trajectories that do
-and do not know how sharply the demonstrations turn.
+"""Largest second differences of demonstrations, single samples, their Gaussian mean, and robust trajectories with and
+without the curvature of the demonstrations.
 
     python benchmarks/smoothness.py --samples results/paper/samples.sqlite --out docs/tables/smoothness.md
 
-The samples are those that `rip eval --suite table1` stored; no model is asked. A turn is the largest second difference
-of any of the gripper's points between one step and the next two.
+The samples are those that `rip eval --suite table1` stored; no model is needed. Second differences are those of any of
+the gripper's points over three successive steps.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def sharpest_turn(trajectory: Trajectory) -> float:
 
 
 def turns(context: Context, scene: LocatedScene, proposal: Proposal) -> tuple[list[float], float]:
-    """The sharpest turns in the order of `COLUMNS` but the first, and what knowing those shown moves at key steps."""
+    """Largest second differences for all but the first of `COLUMNS`, and the shift of key steps by known curvature."""
     unknown = replace(context, prompt=replace(context.prompt, curvature=None))
     gaussian, free, robust = (
         aggregate(known, scene, proposal, Settings(dof=dof)).trajectory
@@ -43,7 +43,7 @@ def turns(context: Context, scene: LocatedScene, proposal: Proposal) -> tuple[li
 
 
 def measured(task_name: str, data: Path, samples: Path, llm: str, scenes: int) -> tuple[str, ...]:
-    """A line of the table."""
+    """One line of the table."""
     rows, moved = [], []
     for _, context, scene, proposal in proposals(task_name, data, samples, llm, scenes):
         row, difference = turns(context, scene, proposal)

@@ -1,4 +1,4 @@
-"""What a language model proposed in the scenes of a run of `rip eval`, from its stored samples."""
+"""Proposals of a language model in the scenes of a run of `rip eval`, from its stored samples."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NUM_DEMOS, NUM_QUERIES = 10, 5
 def proposals(
     task_name: str, data: Path, samples: Path, llm: str, scenes: int
 ) -> Iterator[tuple[int, Context, LocatedScene, Proposal]]:
-    """Each scene's seed, the demonstrations' context, what was located in the scene, and what was proposed there."""
+    """For each scene: seed, context of the demonstrations, located keypoints, and proposal."""
     task = make_task(task_name)
     demonstrations = rip.load_demonstrations(data / task_name, task=task_name, limit=NUM_DEMOS)
     model = ReplayedModel(SampleStore(samples), model_name(llm))
@@ -44,9 +44,9 @@ def proposals(
 
 
 def arguments(doc: str | None) -> argparse.ArgumentParser:
-    """What every benchmark on stored samples must be told, but where the samples are."""
+    """Arguments of all benchmarks on stored samples, except the samples."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path("data"), help="where the demonstrations are")
+    parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the demonstrations")
     parser.add_argument("--tasks", nargs="+", default=SIMULATION_TASKS)
     parser.add_argument("--llm", default="embedded", help="the model of that run")
     parser.add_argument("--out", type=Path, required=True, help="the table")

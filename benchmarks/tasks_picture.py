@@ -1,4 +1,4 @@
-"""Draws the pictures of the tasks in docs/: what the camera sees, and the demonstrator at work.
+"""Draws the pictures of the tasks in docs/: the camera image, and the demonstrator during the task.
 
 python benchmarks/tasks_picture.py maniskill docs/images/tasks.jpg
 python benchmarks/tasks_picture.py aloha docs/images/aloha.jpg
@@ -17,7 +17,7 @@ from robust_instant_policy.trajectory import downsample
 
 SEED = 4
 SIDE = 240
-AT_SHARE = 0.72  # of the execution, when the still is taken
+AT_SHARE = 0.72  # of the execution, at which the second picture is taken
 
 
 def columns(names: Sequence[str]) -> list[np.ndarray]:

@@ -1,7 +1,7 @@
-"""Copies result tables into README and docs, so that they can't drift: python scripts/include_results.py [--check]
+"""Copies result tables into README and docs: python scripts/include_results.py [--check]
 
-A page holds ``<!-- include: results/… -->`` and ``<!-- end -->`` on lines of their own; what stands between them is
-replaced by the file. With ``--check`` nothing is written and a difference is an error.
+The text between the lines ``<!-- include: results/… -->`` and ``<!-- end -->`` of a page is replaced by the file. With
+``--check`` nothing is written, and a difference is an error.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def main(check: bool) -> int:
         text = page.read_text()
         missing = [file for _, file, _ in BLOCK.findall(text) if not (ROOT / file).exists()]
         if missing:
-            print(f"{page.name} includes {', '.join(missing)}, which is not there")
+            print(f"{page.name} includes {', '.join(missing)}, which does not exist")
             return 1
         if included(text) != text:
             stale.append(page.name)

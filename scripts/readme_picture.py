@@ -1,4 +1,4 @@
-"""README's picture of a run: python scripts/readme_picture.py runs/push-cube-0 docs/images/push-cube.gif"""
+"""Draws the README's picture of a run: python scripts/readme_picture.py runs/push-cube-0 docs/images/push-cube.gif"""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from robust_instant_policy.reporting.pictures import keypoint_colour, tool_point
 
 HEIGHT = 360  # pixels
 EVERY = 2  # of the video's frames
-FRAME_MS = 145  # twice the frames' distance, as every second one is taken
+FRAME_MS = 145  # twice the frames' interval, because every second frame is used
 COLOURS = 256
 
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Makes .venv/ with everything that `make demo` and `make test` need, system packages included.
-# Safe to run again: when nothing changed it ends at once.
+# Can be repeated: it ends at once if nothing changed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -117,7 +117,7 @@ pip_install() {
 }
 
 if ! .venv/bin/python -c 'import torch' 2>/dev/null; then
-  # The plain index serves a build with several GB of CUDA; prefer the CPU build where it can be had.
+  # The plain index serves a build with several GB of CUDA; prefer the CPU build if its index can be reached.
   index=()
   if "$python" -c "import urllib.request as u; u.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
     index=(--index-url "$TORCH_CPU_INDEX" --extra-index-url https://pypi.org/simple)
@@ -134,7 +134,7 @@ lacking=$(.venv/bin/python -m pip check | grep -vE ' requires (mplib|dm-control)
 [ -z "$lacking" ] || die "constraints.txt is incomplete: $lacking"
 
 if ! mujoco_renders; then
-  say "no OpenGL that renders without a screen; installing Mesa's"
+  say "no OpenGL for rendering without a screen; installing Mesa"
   apt_install libegl1 libgl1-mesa-dri || true
   mujoco_renders || apt_install libosmesa6 || true
   mujoco_renders || die "needs OpenGL without a screen; install libegl1 and libgl1-mesa-dri, or libosmesa6, and run again"

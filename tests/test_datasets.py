@@ -279,6 +279,6 @@ def test_a_video_without_images_leaves_no_file_and_odd_images_are_refused(tmp_pa
         with pytest.raises(InvalidValueError, match="even"):
             video.add(np.zeros((31, 40, 3), np.uint8))
         video.add(np.zeros((32, 40, 3), np.uint8))
-        with pytest.raises(InvalidValueError, match="alike"):
+        with pytest.raises(InvalidValueError, match="of one size"):
             video.add(np.zeros((32, 42, 3), np.uint8))
     assert (tmp_path / "run.mp4").stat().st_size > 100

@@ -130,7 +130,7 @@ def test_three_points_that_are_no_gripper_are_refused(task, attempt):
     task.reset(3)
     actions = downsample(attempt.demonstration.trajectory).actions.copy()
     actions[5, :9] = np.tile(actions[5, :3], 3)
-    with pytest.raises(UnreachableError, match="no gripper"):
+    with pytest.raises(UnreachableError, match="miss the gripper"):
         task.execute(Trajectory.from_actions(actions))
 
 

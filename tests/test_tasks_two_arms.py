@@ -98,7 +98,7 @@ def test_a_stroke_that_waits_begins_when_the_other_hand_is_done():
     starts = np.stack([downward(-0.3, 0.0, 0.2), downward(0.3, 0.0, 0.2)])
     there = [downward(-0.2, 0.1, 0.1)[None], downward(0.2, 0.1, 0.1)[None]]
     for waits in (False, True):
-        strokes = [Stroke(there[1], closed=True, hand=1), Stroke(there[0], closed=True, waits=waits)]
+        strokes = [Stroke(there[1], closed=True, arm=1), Stroke(there[0], closed=True, waits=waits)]
         poses, closed = perform(starts, strokes, np.random.default_rng(0), rate_hz=50.0)
         assert poses.shape == (len(closed), 2, 4, 4)
         shut = closed.argmax(axis=0)

@@ -18,7 +18,7 @@ from robust_instant_policy.geometry import FloatArray, GripperTriangle, as_numbe
 ACTION_DIM = 10  # gripper point xyz, two fingertips xyz, gripper state
 STATE_INDEX = 9
 STATE_ROUNDING = 1e-6  # by which a gripper state may lie outside [0, 1]
-TARGET_STEPS = 30  # "a length of approximately 30" (Oh et al. 2025)
+TARGET_STEPS = 30  # "a length of approximately 30" (Oh et al. 2025, Sec. V-A.3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""`rip check`: do demonstrations, and a new scene, fit together and belong to one camera and one task?"""
+"""`rip check`: check demonstrations, and a new scene, against each other."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from robust_instant_policy.sanity import Finding, check_demonstrations, errors
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--demos", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--observation", type=Path, metavar="FILE", help="a new scene, as for rip plan")
+    parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
+    parser.add_argument("--observation", type=Path, metavar="FILE", help="a new scene: .npz, as for rip plan")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR-check.html)")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print every finding; 1 where one of them is an error."""
+    """Print every finding and write the page; returns 1 if a finding is an error."""
     observation = None if options.observation is None else Observation.load(options.observation)
     demonstrations = load_demonstrations(options.demos)
     report = check_demonstrations(demonstrations)
@@ -38,6 +38,6 @@ def run(options: argparse.Namespace) -> int:
 
 def _tell(findings: tuple[Finding, ...], what: str) -> None:
     if not findings:
-        print(f"  {what}: nothing wrong was found")
+        print(f"  {what}: no problem found")
     for finding in findings:
         print(f"  {finding}")

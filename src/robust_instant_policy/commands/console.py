@@ -1,4 +1,4 @@
-"""What the command prints while it works: one line a finished stage, a moving bar for the one under way."""
+"""Progress on the terminal: one line per finished stage, a progress bar for the current one."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from robust_instant_policy.policies.policy import Stage
 
-TRAINING_LINE_S = 30.0  # between two lines about a training, where there is no terminal to draw a bar on
+TRAINING_LINE_S = 30.0  # between two progress lines of a training without a terminal
 
 
 class StageConsole:
-    """Prints stages with their times and remembers them in ``stages``."""
+    """Prints stages with their times and stores them in ``stages``."""
 
     def __init__(self) -> None:
         self.console = Console(highlight=False, soft_wrap=True)
@@ -27,7 +27,7 @@ class StageConsole:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time a stage, with a moving bar on a terminal; a stage that raises is not counted."""
+        """Time a stage, with a progress bar on a terminal; a stage that raises is not counted."""
         self.done_so_far(name, 0, 0)
         start = time.perf_counter()
         try:
@@ -39,7 +39,7 @@ class StageConsole:
         self.say(f"  {name:<34}{seconds:7.1f} s")
 
     def done_so_far(self, name: str, done: int, total: int) -> None:
-        """Move the bar; a `Progress` for the policies."""
+        """Update the bar; a `Progress` for the policies."""
         if not self.console.is_terminal:
             return
         if self._bar is None:
@@ -63,7 +63,7 @@ class StageConsole:
 
 
 class TrainingScreen:
-    """A `policies.training.TrainingReport`: loss and time left, as a bar or, without a terminal, as lines."""
+    """A `policies.training.TrainingReport`: loss and remaining time, as a bar or, without a terminal, as lines."""
 
     def __init__(self, screen: StageConsole):
         self._screen = screen

@@ -1,4 +1,4 @@
-"""`rip demo`: show a task, draw a new scene, plan, execute, and write a folder that explains the result."""
+"""`rip demo`: record demonstrations, plan in a new scene, execute, and write a run folder with a report."""
 
 from __future__ import annotations
 
@@ -30,17 +30,26 @@ from robust_instant_policy.tasks.task import Task
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--task", default="push-cube", help="task to show (default: %(default)s)")
-    parser.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
-    parser.add_argument("--seed", type=seed, default=0, help="which new scene (default: %(default)s)")
-    parser.add_argument("--demos", default="10", metavar="N|DIR", help="how many demonstrations, or a folder of them")
+    parser.add_argument("--task", default="push-cube", help="name of the task (default: %(default)s)")
+    parser.add_argument(
+        "--llm",
+        default="embedded",
+        help="language model: embedded, gguf:PATH, openai:MODEL or http://…#MODEL (default: %(default)s)",
+    )
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the new scene (default: %(default)s)")
+    parser.add_argument(
+        "--demos",
+        default="10",
+        metavar="N|DIR",
+        help="number of demonstrations, or a folder of them (default: %(default)s)",
+    )
     parser.add_argument("--out", type=Path, help="run folder (default: runs/TASK-SEED)")
     add_method(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     if options.demos.isdecimal() and int(options.demos) == 0:
-        raise UsageError("--demos 0: show the task at least once")
+        raise UsageError("--demos 0: the task must be shown at least once")
     out = options.out or RUNS / f"{options.task}-{options.seed}"
     run_demo(options.task, options.llm, options.seed, options.demos, out, DATA, method_settings(options))
     return 0
@@ -49,15 +58,15 @@ def run(options: argparse.Namespace) -> int:
 def run_demo(
     task_name: str, llm_spec: str, seed: int, demonstrations: str, out: Path, data: Path, options: dict[str, Any]
 ) -> RunRecord:
-    """Record (unless they are there), plan and execute; writes the run folder ``out``.
+    """Record missing demonstrations, plan and execute; writes the run folder ``out``.
 
-    ``demonstrations`` is a number, recorded into ``data/TASK`` where they are missing, or a folder.
+    ``demonstrations`` is a folder, or a number: those that ``data/TASK`` lacks are recorded.
     """
     if holds_results(out):
-        raise UsageError(f"{out} holds an evaluation; give the demo another folder with --out")
+        raise UsageError(f"{out} holds an evaluation; choose another folder with --out")
     screen = StageConsole()
     scene = scene_seed(seed, 0)
-    screen.say(f"{task_name}: the robot is shown the task, then does it in a scene it has not seen (number {scene})")
+    screen.say(f"{task_name}: demonstrations, then a plan and its execution in a new scene (seed {scene})")
     with screen.stage("simulator"):
         task = make_task(task_name)
     try:
@@ -93,9 +102,7 @@ def _run(
         model.close()
     for stage in plan.usage.stages:
         tokens = (
-            f", {stage.prompt_tokens:,} tokens given, {stage.completion_tokens:,} written"
-            if stage.prompt_tokens
-            else ""
+            f", {stage.prompt_tokens:,} tokens read, {stage.completion_tokens:,} written" if stage.prompt_tokens else ""
         )
         screen.say(f"    {stage.name:<32}{stage.seconds:7.3f} s{tokens}")
     ignored = [f"{index + 1} from step {plan.onset[index]}" for index in np.flatnonzero(plan.hallucinated)]
@@ -149,5 +156,5 @@ def _demonstrations(task: Task, wanted: str, data: Path, screen: StageConsole) -
 
     with screen.stage(f"{wanted} demonstrations"):
         shown = obtain_demonstrations(task, data / task.name, int(wanted), progress)
-    screen.say(f"    in {data / task.name}; the demonstrator failed and started again {thrown_away} times")
+    screen.say(f"    in {data / task.name}; {thrown_away} failed attempts discarded")
     return shown

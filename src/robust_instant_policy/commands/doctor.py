@@ -1,4 +1,4 @@
-"""`rip doctor`: what works on this machine, and what to do about what does not."""
+"""`rip doctor`: check what this machine needs for `rip`, and say how to install what is missing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from robust_instant_policy.errors import install_command
 
-NEEDED_DISK_GB = 2.0  # datasets, runs and the assembled model
+NEEDED_DISK_GB = 2.0  # for datasets, runs and the embedded model
 NEEDED_MEMORY_GB = 4.0  # peak of `rip demo`
 RENDERER_TIMEOUT_S = 120
 EXTRAS = {
@@ -31,7 +31,7 @@ EXTRAS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the diagnosis; ``remedy`` is empty where there is nothing to do."""
+    """One line of the report; ``remedy`` says what to do if it does not work."""
 
     name: str
     works: bool
@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def examine(folder: Path) -> Iterator[Finding]:
-    """Yield what was found, one after the other; ``folder`` is where data and runs will be written."""
+    """Yield the findings one by one; ``folder`` is where data and runs will be written."""
     supported = (3, 11) <= sys.version_info[:2] <= (3, 13)
     yield Finding("python", supported, platform.python_version(), "needs Python 3.11, 3.12 or 3.13")
     for extra, modules in EXTRAS.items():
@@ -62,7 +62,7 @@ def examine(folder: Path) -> Iterator[Finding]:
         yield Finding(
             f"extra [{extra}]",
             not missing,
-            f"lacks {', '.join(missing)}" if missing else "installed",
+            f"missing: {', '.join(missing)}" if missing else "installed",
             install_command(extra),
         )
     yield _maniskill_renderer()
@@ -71,15 +71,20 @@ def examine(folder: Path) -> Iterator[Finding]:
     yield _attempt("keypoint features", _features, install_command("vision"))
     for key, needed in (
         ("OPENAI_API_KEY", "for --llm openai:…"),
-        ("RIP_API_KEY", "for servers of others"),
+        ("RIP_API_KEY", "for other servers, --llm http…"),
     ):
-        there = f"{key} is set" if os.environ.get(key) else f"{key} is not set; needed only {needed}"
-        yield Finding(key, True, there)
+        status = f"{key} is set" if os.environ.get(key) else f"{key} is not set; needed only {needed}"
+        yield Finding(key, True, status)
     free = shutil.disk_usage(_existing(folder)).free / 1e9
     yield Finding("disk", free >= NEEDED_DISK_GB, f"{free:.1f} GB free", f"free at least {NEEDED_DISK_GB:.0f} GB")
     memory = _available_memory_gb()
     if memory is not None:
-        yield Finding("memory", memory >= NEEDED_MEMORY_GB, f"{memory:.1f} GB available", "close other programs")
+        yield Finding(
+            "memory",
+            memory >= NEEDED_MEMORY_GB,
+            f"{memory:.1f} GB available",
+            f"needs {NEEDED_MEMORY_GB:.0f} GB; close other programs",
+        )
     yield Finding("cores", True, str(os.cpu_count()))
 
 
@@ -94,9 +99,9 @@ def _mujoco_renderer() -> Finding:
 
 
 def _tried(name: str, simulator: str, extra: str, module: str, remedy: str) -> Finding:
-    """What ``python -m module`` says, in a process of its own: a bad driver may take the process down with it."""
+    """Output of ``python -m module`` in a separate process, because a faulty driver may crash the process."""
     if importlib.util.find_spec(simulator) is None:
-        return Finding(name, False, "not tried, the simulator is missing", install_command(extra))
+        return Finding(name, False, "not tested: the simulator is not installed", install_command(extra))
     try:
         result = subprocess.run(
             [sys.executable, "-m", module], capture_output=True, text=True, timeout=RENDERER_TIMEOUT_S, check=False
@@ -110,7 +115,7 @@ def _tried(name: str, simulator: str, extra: str, module: str, remedy: str) -> F
 def _attempt(name: str, probe: Callable[[], str], remedy: str) -> Finding:
     try:
         return Finding(name, True, probe())
-    except Exception as error:  # whatever is wrong, the rest is looked at, too
+    except Exception as error:  # one failed test must not stop the others
         return Finding(name, False, str(error) or type(error).__name__, remedy)
 
 

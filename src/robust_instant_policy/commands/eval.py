@@ -1,4 +1,4 @@
-"""`rip eval`: suites on the screen, with their samples and rows on disk, then tables, figures and a page."""
+"""`rip eval`: run suites, store samples and rows, then write tables, figures and a page."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from robust_instant_policy.reporting.training import keep_training_picture
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--suite", nargs="+", metavar="SUITE", help="analyses of the paper: table1 demos queries dof downsampling "
-        "trajectories, or all (default: just --methods in --tasks)"
+        "trajectories, or all (default: --methods in --tasks, no suite)"
     )  # fmt: skip
     parser.add_argument("--tasks", nargs="+", metavar="TASK", help="default: push-cube, or those of the suite")
     parser.add_argument(
@@ -44,25 +44,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of rip rip-gauss rip-adaptive kat dp kat-dp neighbours gp "
         "(default: rip rip-gauss kat, or those of the suite)",
     )
-    parser.add_argument("--demos", type=positive, default=10, metavar="N")
-    parser.add_argument("--episodes", type=positive, default=10, metavar="N", help="scenes (default: %(default)s)")
-    parser.add_argument("--queries", type=positive, default=5, metavar="Q")
-    parser.add_argument("--seed", type=seed, default=0)
-    parser.add_argument("--llm", default="embedded")
     parser.add_argument(
-        "--objects", choices=("seen", "unseen"), default="seen", help="test with objects like those shown, or others"
+        "--demos", type=positive, default=10, metavar="N", help="demonstrations per task (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--episodes", type=positive, default=10, metavar="N", help="scenes per task (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--queries", type=positive, default=5, metavar="Q", help="samples per plan (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the first scene (default: %(default)s)")
+    parser.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
+    parser.add_argument(
+        "--objects",
+        choices=("seen", "unseen"),
+        default="seen",
+        help="objects of the test scenes: as demonstrated, or others",
     )
     add_assets(parser)
-    parser.add_argument("--steps", type=positive, metavar="N", help="how long dp and kat-dp are trained")
+    parser.add_argument("--steps", type=positive, metavar="N", help="training steps of dp and kat-dp (default: 1000)")
     parser.add_argument(
-        "--checkpoints", type=Path, default=CHECKPOINTS, metavar="DIR", help="where trained weights are"
+        "--checkpoints",
+        type=Path,
+        default=CHECKPOINTS,
+        metavar="DIR",
+        help="folder of trained weights (default: %(default)s)",
     )
-    parser.add_argument("--replay", action="store_true", help="answer from the stored samples only, without a model")
-    parser.add_argument("--workers", type=positive, metavar="N", help="default: 1, or a Ray cluster's cores")
-    parser.add_argument("--ray", metavar="ADDRESS", help="work on the Ray cluster at this address ('auto': this one)")
-    parser.add_argument("--keep", action="store_true", help="do not run again what another version of the code has run")
-    parser.add_argument("--no-videos", action="store_true", help="do not film failed episodes once more")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--replay", action="store_true", help="use stored samples only, without a model")
+    parser.add_argument(
+        "--workers", type=positive, metavar="N", help="processes (default: 1, or the cores of the Ray cluster)"
+    )
+    parser.add_argument("--ray", metavar="ADDRESS", help="use the Ray cluster at this address ('auto': the local one)")
+    parser.add_argument(
+        "--keep", action="store_true", help="do not repeat what another version of the code has executed"
+    )
+    parser.add_argument("--no-videos", action="store_true", help="no videos of failed episodes")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to continue")
     add_method(parser)
 
 
@@ -101,13 +118,13 @@ def run(options: argparse.Namespace) -> int:
 def evaluate(
     suites: Sequence[Suite], setup: Setup, out: Path, workers: Workers, arguments: Sequence[str], keep: bool
 ) -> None:
-    """Run what is missing of ``suites`` in ``out``, on the screen; then tables, figures and page. See `run_suites`."""
+    """Run what ``out`` lacks of ``suites`` with progress output, then write tables, figures and page."""
     screen = StageConsole()
 
     def recording(task: str, there: int, count: int, thrown_away: int) -> None:
-        screen.done_so_far(f"{task}: recording ({thrown_away} thrown away)", there, count)
+        screen.done_so_far(f"{task}: recording ({thrown_away} discarded)", there, count)
         if there == count:
-            screen.say(f"  {task}: {count} demonstrations recorded, {thrown_away} thrown away")
+            screen.say(f"  {task}: {count} demonstrations recorded, {thrown_away} failed attempts discarded")
 
     def outcome(done: int, total: int, what: Outcome | None) -> None:
         if isinstance(what, Analysis):
@@ -125,4 +142,4 @@ def evaluate(
         run_suites(suites, setup, out, workers, progress, arguments, keep)
     screen.say("")
     screen.say(publish(out))
-    screen.say(f"rows: {out / EPISODES_FILE}; all of it: {out / PAGE_FILE}")
+    screen.say(f"rows: {out / EPISODES_FILE}; page: {out / PAGE_FILE}")

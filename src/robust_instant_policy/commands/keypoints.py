@@ -1,4 +1,4 @@
-"""`rip keypoints`: a page with the keypoints of all demonstrations side by side, and how accurate they are."""
+"""`rip keypoints`: a page with the keypoints of all demonstrations side by side, and their errors."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Camera = Callable[[Observation, int], Observation]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--demos", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
     parser.add_argument("--scenes", type=positive, default=20, metavar="N", help="new scenes (default: %(default)s)")
-    parser.add_argument("--seed", type=seed, default=0)
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the first new scene (default: %(default)s)")
     parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
-    parser.add_argument("--noise", action="store_true", help="with the noise of a stereo depth camera")
+    parser.add_argument("--noise", action="store_true", help="add the noise of a stereo depth camera")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR-keypoints.html)")
 
 
@@ -38,9 +38,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def show_keypoints(demos: Path, features: str, num_scenes: int, noisy: bool, seed: int, out: Path) -> Path:
-    """Write the page to ``out``. Where the demonstrations come from a simulated task, new scenes are drawn and
-    the keypoints in them are compared with the true places of the same material points; ``noisy`` puts the
-    depth camera's noise over all images first.
+    """Write the page to ``out``. For a simulated task, also compare the keypoints of new scenes with the true positions
+    of the same material points. ``noisy`` adds the depth camera's noise to all images.
     """
     screen = StageConsole()
     demonstrations = load_demonstrations(demos)
@@ -65,7 +64,7 @@ def show_keypoints(demos: Path, features: str, num_scenes: int, noisy: bool, see
     else:
         with screen.stage(f"keypoints of {len(images)} demonstrations"):
             extractor.fit(images)
-        screen.say("    the truth is known for simulated tasks only; nothing to compare with")
+        screen.say("    no errors: the true positions are known for simulated tasks only")
     for note in extractor.notes_:
         screen.say(f"    {note}")
     out.write_text(keypoints_page(extractor, images, scenes, accuracy, f"Keypoints of {name}"), encoding="utf-8")

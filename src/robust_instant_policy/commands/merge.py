@@ -1,4 +1,4 @@
-"""`rip merge`: several evaluations in one folder."""
+"""`rip merge`: combine several evaluations in one folder."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from robust_instant_policy.reporting.publication import PAGE_FILE, publish
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders that rip eval --out wrote")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder, or one to be added to")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders written by rip eval")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to add to")
 
 
 def run(options: argparse.Namespace) -> int:
     def report(share: Share) -> None:
-        print(f"{share.folder}: {share.new} executions, {share.known} more known already", flush=True)
+        print(f"{share.folder}: {share.new} new executions, {share.known} already present", flush=True)
 
     merge(options.runs, options.out, report)
     publish(options.out)

@@ -8,26 +8,26 @@ from typing import Any
 
 from robust_instant_policy.tasks.task import bounded_seed
 
-DATA = Path("data")  # where demonstrations are recorded, a folder a task
+DATA = Path("data")  # demonstrations, one folder per task
 RUNS = Path("runs")
 CHECKPOINTS = Path("checkpoints")
 SEED_BITS = 62  # seeds, and those counted up from them, stand in tables of 64-bit integers
 
 
 def natural(text: str) -> int:
-    """A whole number from 0."""
+    """A whole number, 0 or more."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"must be a whole number, not {text!r}")
     return int(text)
 
 
 def seed(text: str) -> int:
-    """Any whole number from 0; what no simulator or table could take becomes another, always the same."""
+    """A whole number, 0 or more; one that is too large for simulators and tables is mapped to a smaller one."""
     return bounded_seed(natural(text), SEED_BITS)
 
 
 def positive(text: str) -> int:
-    """A whole number from 1."""
+    """A whole number, 1 or more."""
     if natural(text) == 0:
         raise argparse.ArgumentTypeError("must be at least 1")
     return int(text)
@@ -35,18 +35,40 @@ def positive(text: str) -> int:
 
 def add_assets(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--assets", choices=("code", "maniskill"), default="code", help="objects made in code, or ManiSkill's downloads"
+        "--assets",
+        choices=("code", "maniskill"),
+        default="code",
+        help="objects built in code, or downloaded for ManiSkill (default: %(default)s)",
     )
 
 
 def add_method(parser: argparse.ArgumentParser) -> None:
-    """The settings of the method; `method_settings` reads them."""
-    parser.add_argument("--frames", choices=("adaptive", "world"), default="adaptive")
-    parser.add_argument("--layout", choices=("factorised", "sequence"), default="factorised")
-    parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
-    parser.add_argument("--downsampling", choices=("masked", "uniform"), default="masked")
+    """Add the settings of the method; `method_settings` reads them."""
     parser.add_argument(
-        "--deadline", type=positive, default=300, metavar="SECONDS", help="for the answers of one plan (default: 300)"
+        "--frames",
+        choices=("adaptive", "world"),
+        default="adaptive",
+        help="frames of the prompt; world: as in the paper (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--layout",
+        choices=("factorised", "sequence"),
+        default="factorised",
+        help="layout of the prompt; sequence: as in the paper (default: %(default)s)",
+    )
+    parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
+    parser.add_argument(
+        "--downsampling",
+        choices=("masked", "uniform"),
+        default="masked",
+        help="masked keeps gripper changes (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--deadline",
+        type=positive,
+        default=300,
+        metavar="SECONDS",
+        help="limit for the answers of one plan (default: %(default)s)",
     )
 
 
@@ -56,6 +78,6 @@ def method_settings(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def beside(folder: Path, ending: str) -> Path:
-    """The path of a page named like ``folder``, next to it."""
+    """Path of a page beside ``folder``, with its name."""
     named = folder if folder.name and folder.name != ".." else folder.resolve()
     return named.with_name(named.name + ending)

@@ -1,4 +1,4 @@
-"""`rip plan`: a plan for one observation; nothing moves."""
+"""`rip plan`: plan for one observation and write the plan; nothing is executed."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from robust_instant_policy.policies import RobustInstantPolicy
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--demos", required=True, metavar="DIR")
+    parser.add_argument("--demos", required=True, metavar="DIR", help="folder of demonstrations")
     parser.add_argument(
         "--observation", required=True, metavar="FILE", help=".npz with rgb, depth, intrinsics, camera_pose"
     )
-    parser.add_argument("--llm", default="embedded")
-    parser.add_argument("--queries", type=positive, default=5, metavar="Q")
-    parser.add_argument("--out", type=Path, default=Path("plan.json"), metavar="FILE")
+    parser.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
+    parser.add_argument("--queries", type=positive, default=5, metavar="Q", help="samples (default: %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("plan.json"), metavar="FILE", help="the plan (default: %(default)s)"
+    )
     add_method(parser)
 
 

@@ -1,4 +1,4 @@
-"""`rip record`: demonstrations of a simulated task into a dataset folder."""
+"""`rip record`: record demonstrations of a simulated task into a dataset folder."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from robust_instant_policy.tasks.record import record
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--task", required=True)
-    parser.add_argument("--episodes", type=positive, default=10)
-    parser.add_argument("--seed", type=seed, default=0, help="where a new folder starts drawing scenes")
-    parser.add_argument("--images", action="store_true", help="keep the camera's images along the way")
+    parser.add_argument("--task", required=True, help="name of the task")
+    parser.add_argument("--episodes", type=positive, default=10, help="demonstrations (default: %(default)s)")
     parser.add_argument(
-        "--every", type=positive, default=1, metavar="N", help="keep every N-th step only: 5 of 55 Hz leaves 11 Hz"
+        "--seed", type=seed, default=0, help="seed of the first scene of a new folder (default: %(default)s)"
+    )
+    parser.add_argument("--images", action="store_true", help="record an image for each step")
+    parser.add_argument(
+        "--every", type=positive, default=1, metavar="N", help="keep every N-th step: 5 reduces 55 Hz to 11 Hz"
     )
     add_assets(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to continue")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -47,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
     finally:
         task.close()
     screen.say(
-        f"{options.out}: {options.episodes} demonstrations of {task.name}, {thrown_away} failed attempts thrown away"
+        f"{options.out}: {options.episodes} demonstrations of {task.name}, {thrown_away} failed attempts discarded"
     )
     for finding in check_demonstrations(load_demonstrations(options.out)).findings:
         screen.say(f"    {finding}")

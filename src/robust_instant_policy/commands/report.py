@@ -1,4 +1,4 @@
-"""`rip report`: the report of a run, or of an evaluation, written again from its files."""
+"""`rip report`: write the report of a run, or of an evaluation, again from its files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from robust_instant_policy.reporting.run import write_report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=Path, metavar="DIR")
+    parser.add_argument("folder", type=Path, metavar="DIR", help="folder written by rip demo or rip eval")
 
 
 def run(options: argparse.Namespace) -> int:

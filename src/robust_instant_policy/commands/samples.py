@@ -1,4 +1,4 @@
-"""`rip samples`: what a file of stored answers holds, and its export."""
+"""`rip samples`: count or export the stored answers of a language model."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from robust_instant_policy.llm import SampleStore
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help="samples.sqlite of an evaluation")
-    parser.add_argument("--export", choices=("jsonl", "csv"), help="write all answers to standard output")
+    parser.add_argument(
+        "--export", choices=("jsonl", "csv"), help="write all answers to standard output in this format"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -23,7 +25,7 @@ def run(options: argparse.Namespace) -> int:
         if options.export:
             store.export(sys.stdout, options.export)
             return 0
-        print(f"{'model':<40}{'prompts':>10}{'answers':>10}{'tokens given':>15}{'tokens written':>16}")
+        print(f"{'model':<40}{'prompts':>10}{'answers':>10}{'tokens read':>15}{'tokens written':>16}")
         for held in store.models():
             print(
                 f"{held.model:<40}{held.queries:>10,}{held.answers:>10,}"

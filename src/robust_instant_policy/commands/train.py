@@ -1,4 +1,4 @@
-"""`rip train`: a trained method on the screen, and a picture of what it learned."""
+"""`rip train`: train a method with progress output, and write a figure of the loss and of samples."""
 
 from __future__ import annotations
 
@@ -19,15 +19,21 @@ from robust_instant_policy.tasks import TASK_NAMES, make_task
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--task", required=True)
+    parser.add_argument("--task", required=True, help="name of the task")
     parser.add_argument("--method", required=True, metavar="METHOD", help="dp or kat-dp")
-    parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="dp needs images along the way")
-    parser.add_argument("--limit", type=positive, metavar="N", help="show it the first N of them only")
-    parser.add_argument("--steps", type=positive, metavar="N", help="of gradient descent")
-    parser.add_argument("--seed", type=seed, default=0)
-    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where there is one")
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="rip eval --checkpoints DIR finds it there"
+        "--demos",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder of demonstrations; dp needs images of all steps",
+    )
+    parser.add_argument("--limit", type=positive, metavar="N", help="use the first N demonstrations only")
+    parser.add_argument("--steps", type=positive, metavar="N", help="training steps (default: 1000)")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the training (default: %(default)s)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda if available")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of checkpoints, for rip eval --checkpoints"
     )
 
 
@@ -40,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
 def train(task: str, method: str, demos: Path, limit: int | None, training: Training) -> None:
     """Train ``method`` on the first ``limit`` demonstrations of ``task`` in the folder ``demos``, or all of them.
 
-    The checkpoint goes to ``training.checkpoints``, and beside it a picture of the loss and of samples.
+    Writes the checkpoint to ``training.checkpoints``, and beside it a figure of the loss and of samples.
     """
     if method not in TRAINED_METHODS:
         raise UnknownNameError("trained method", method, TRAINED_METHODS)
@@ -55,11 +61,11 @@ def train(task: str, method: str, demos: Path, limit: int | None, training: Trai
     picture = trained.path.with_suffix(".svg")
     write_whole(picture, training_picture(policy))
     screen.say(f"{trained.path}: {len(trained.losses)} steps in {trained.seconds:.0f} s")
-    screen.say(f"{picture}: how the loss fell, and samples beside demonstrations")
+    screen.say(f"{picture}: the loss, and samples beside demonstrations")
 
 
 def _workspace(task: str) -> FloatArray | None:
-    """The task's, so that the same keypoints are found as when it is evaluated; None for a task of one's own."""
+    """Workspace of the task, so that keypoints are those of the evaluation; None for your own tasks."""
     if task not in TASK_NAMES:
         return None
     simulated = make_task(task)

@@ -1,4 +1,4 @@
-"""`rip view`: a page that shows every demonstration of a folder."""
+"""`rip view`: write a page that shows every demonstration of a folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from robust_instant_policy.reporting.demonstrations import write_page
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--demos", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR.html)")
 
 

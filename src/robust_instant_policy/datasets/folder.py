@@ -1,7 +1,7 @@
-"""The tables of a LeRobotDataset v3.0 folder, ours or anyone's, with everything that can be wrong said in one line.
+"""The tables of any LeRobotDataset v3.0 folder; every problem is an error in one line.
 
-A folder may come from anywhere, so what it says is checked once, when it is read: types and ranges of what
-``meta/info.json`` and ``meta/episodes`` say, and that every path they lead to stays inside the folder.
+A folder may come from anywhere, so its content is checked once, when it is read: types and ranges in
+``meta/info.json`` and ``meta/episodes``, and that all their paths stay inside the folder.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from robust_instant_policy.files import excerpt, finished_files, open_regular, r
 from robust_instant_policy.geometry import FloatArray
 
 CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
-STATISTICS_PREFIX = "stats/"  # columns of meta/episodes that only those who normalise need
+STATISTICS_PREFIX = "stats/"  # columns of meta/episodes that are used for normalisation only
 INFO_ENTRIES = ("codebase_version", "fps", "features", "total_episodes", "total_frames", "data_path")
 MAX_INDEX = 2**31  # of an episode, file, chunk or frame
 MAX_VALUES = 2**28  # numbers in the columns read from one file; v3.0 aims at files of 100 MB
@@ -40,8 +40,7 @@ class Folder:
     """A LeRobotDataset v3.0: ``info`` is its ``meta/info.json``, ``episodes`` the rows of ``meta/episodes`` in order,
     without statistics, both checked.
 
-    Its tables are read when asked for; every method raises `DatasetError`, naming the file, for one that is
-    missing or damaged.
+    Tables are read on access; every method raises `DatasetError`, with the file name, for a missing or damaged one.
     """
 
     root: Path
@@ -118,7 +117,7 @@ class Folder:
 def open_folder(path: Path, task: str | None = None) -> Folder:
     """Open a LeRobotDataset v3.0 folder with at least one episode.
 
-    ``task`` is only named in advice. Raises `DatasetError` for a folder that is missing, empty, half-written,
+    ``task`` is used in the error message only. Raises `DatasetError` for a folder that is missing, empty, half-written,
     of another format or without episodes.
     """
     advice = f"record demonstrations with: rip record --task {task or 'TASK'} --episodes 10 --out {path}"
@@ -131,7 +130,7 @@ def open_folder(path: Path, task: str | None = None) -> Folder:
     if not (path / layout.INFO_PATH).exists():
         if (path / layout.RIP_PATH).exists():
             raise NoDemonstrationsError(f"{path} holds no finished demonstration yet; {advice}")
-        raise DatasetError(f"{path} is no demonstrations folder: it has no {layout.INFO_PATH}; {advice}")
+        raise DatasetError(f"{path} is not a demonstrations folder: it has no {layout.INFO_PATH}; {advice}")
     file = inside(path, layout.INFO_PATH)
     info = read_json(file)
     missing = [entry for entry in INFO_ENTRIES if entry not in info]
@@ -154,7 +153,7 @@ def open_folder(path: Path, task: str | None = None) -> Folder:
 
 
 def read_recording(root: Path) -> dict[str, Any]:
-    """What ``meta/rip.json`` says about our own folders, checked. Raises `DatasetError` naming the file."""
+    """The checked content of ``meta/rip.json``. Raises `DatasetError` with the file name."""
     file = inside(root, layout.RIP_PATH)
     own = read_json(file)
     seeds = own.get("discarded_seeds", [])
@@ -166,7 +165,7 @@ def read_recording(root: Path) -> dict[str, Any]:
 
 
 def read_seed(row: Mapping[str, Any]) -> int | None:
-    """The seed that our own folders keep in a row of ``meta/episodes``. Raises `DatasetError` for anything else."""
+    """The seed in a row of ``meta/episodes``. Raises `DatasetError` for another type."""
     seed = row.get(layout.SEED_COLUMN)
     if seed is not None and not isinstance(seed, int):
         raise DatasetError(
@@ -176,7 +175,7 @@ def read_seed(row: Mapping[str, Any]) -> int | None:
 
 
 def inside(root: Path, relative: str | Path) -> Path:
-    """The path of a file of the folder. Raises `DatasetError` for one that leads out of it, also by symbolic links."""
+    """The path of a file of the folder. Raises `DatasetError` if it is outside, also through symbolic links."""
     path = root / relative
     try:
         within = path.resolve().is_relative_to(root.resolve())
@@ -185,15 +184,15 @@ def inside(root: Path, relative: str | Path) -> Path:
     if not within:
         raise DatasetError(
             f"{root} names a file outside of itself: {excerpt(relative)!r}; "
-            "where these are symbolic links of your own, copy the folder with: cp -rL"
+            "if these are your own symbolic links, copy the folder with: cp -rL"
         )
     return path
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None, skip: str | None = None) -> pa.Table:
-    """A parquet file, or only some of its ``columns``, or those that do not begin with ``skip``.
+    """A parquet file, or only its ``columns``, or those that do not begin with ``skip``.
 
-    Raises `DatasetError` naming the file.
+    Raises `DatasetError` with the file name.
     """
     try:
         with open_regular(path) as file, pq.ParquetFile(file) as parquet:
@@ -225,7 +224,7 @@ def _count_values(metadata: pq.FileMetaData, names: set[str]) -> int:
     return count
 
 
-@lru_cache(maxsize=1)  # files that hold many episodes are read once, not once for each
+@lru_cache(maxsize=1)  # files with many episodes are read once, not once per episode
 def _read_data(path: Path, names: tuple[str, ...], stamp: tuple[int, ...]) -> pa.Table:
     table = read_table(path, ["episode_index", "frame_index", *names])
     for name in ("episode_index", "frame_index"):
@@ -289,7 +288,7 @@ def _is_whole(value: object, least: int = 0) -> bool:
 
 
 def _read_episodes(root: Path, count: int) -> list[dict[str, Any]]:
-    """The first ``count`` rows: what lies beyond was not finished when its writer was killed."""
+    """The first ``count`` rows; later ones were not finished when their writer was killed."""
     rows: list[dict[str, Any]] = []
     for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
         table = read_table(inside(root, path.relative_to(root)), skip=STATISTICS_PREFIX)

@@ -1,4 +1,4 @@
-"""The start-of-episode image and depth as PNG files: any viewer opens them, and they lose nothing."""
+"""The start-of-episode image and depth as lossless PNG files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REPAIR = "restore it, or record the folder again"
 MAX_STEPS = np.iinfo(np.uint16).max
 
 
-# What Pillow raises for content that is damaged, or declares more pixels than anyone takes.
+# Pillow's errors for damaged content and for too many declared pixels.
 DAMAGE = (OSError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError, Image.DecompressionBombWarning)
 
 
@@ -33,10 +33,10 @@ def encode_png(image: NDArray) -> bytes:
 
 
 def encode_depth(depth: NDArray[np.float32]) -> tuple[bytes, float]:
-    """16-bit PNG of ``depth (H, W)`` metres, and the metres that one of its steps stands for.
+    """16-bit PNG of ``depth (H, W)`` metres, and the metres per step.
 
-    No reading (NaN, infinity, zero or less) becomes 0. Raises `DatasetError` for depth that 16 bits cannot
-    hold to the millimetre.
+    No reading (NaN, infinity, zero or less) becomes 0. Raises `DatasetError` for depth beyond the
+    range of 16 bits with a resolution of a millimetre.
     """
     metres = np.asarray(depth, dtype=np.float64)
     valid = np.isfinite(metres) & (metres > 0)
@@ -44,7 +44,7 @@ def encode_depth(depth: NDArray[np.float32]) -> tuple[bytes, float]:
     unit = FINE_UNIT_M if furthest <= MAX_STEPS * FINE_UNIT_M else COARSE_UNIT_M
     if furthest > MAX_STEPS * unit:
         raise DatasetError(
-            f"depth reads up to {furthest:.1f} m, but at most {MAX_STEPS * unit:.1f} m can be kept to the millimetre; "
+            f"depth has values up to {furthest:.1f} m; at most {MAX_STEPS * unit:.1f} m can be stored; "
             "set pixels beyond the workspace to NaN"
         )
     steps = np.zeros(metres.shape, dtype=np.uint16)
@@ -76,7 +76,7 @@ def _open(path: Path) -> Image.Image:
 
 
 def decode_image(content: bytes, formats: tuple[str, ...]) -> Image.Image:
-    """The image in a file's ``content``; raises `ValueError` for another format, and for one that is damaged."""
+    """The image in a file's ``content``; raises `ValueError` for another format and for damaged content."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -86,4 +86,4 @@ def decode_image(content: bytes, formats: tuple[str, ...]) -> Image.Image:
         image.load()
         return image
     except DAMAGE as error:
-        raise ValueError(f"it is no image of the kind {' or '.join(formats)}") from error
+        raise ValueError(f"it is not a {' or '.join(formats)} image") from error

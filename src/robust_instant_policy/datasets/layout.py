@@ -1,8 +1,8 @@
-"""Where things lie in a demonstrations folder: a LeRobotDataset v3.0 with a few additions of our own.
+"""File layout of a demonstrations folder: a LeRobotDataset v3.0 with additions.
 
-The format is that of `lerobot` 0.4.4 (``src/lerobot/datasets/lerobot_dataset.py`` and ``utils.py``). It lets a
-file hold one or many episodes; here every episode has files of its own, numbered like the episode, so that
-recording only ever adds files. See ``docs/datasets.md``.
+The format is that of `lerobot` 0.4.4 (``src/lerobot/datasets/lerobot_dataset.py`` and ``utils.py``). It allows
+one or many episodes per file; here each episode has its own files, numbered like the episode, so that
+recording only adds files. See ``docs/datasets.md``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from robust_instant_policy.trajectory import ACTION_DIM
 
 CODEBASE_VERSION = "v3.0"
-RIP_FORMAT = 1  # version of what we add: rip.json, the start/ folder and the rip/ columns
+RIP_FORMAT = 1  # version of the additions: rip.json, the start/ folder and the rip/ columns
 
 INFO_PATH = Path("meta/info.json")
 STATS_PATH = Path("meta/stats.json")
@@ -49,12 +49,12 @@ INDICES = ("chunk_index", "file_index")
 def check_template(template: str, fields: Collection[str]) -> None:
     """Raises `ValueError` unless a path template consists of text and of the ``fields``, in plain formats.
 
-    What remains is safe to format: no attributes or items of the values, no widths of any size.
+    Such a template is safe to format: no attributes or items of the values, no large widths.
     """
     try:
         parts = list(string.Formatter().parse(template))
     except ValueError as error:
-        raise ValueError(f"the path template {template[:100]!r} is none: {error}") from None
+        raise ValueError(f"the path template {template[:100]!r} is invalid: {error}") from None
     for _, field, spec, conversion in parts:
         if field is None:
             continue
@@ -64,18 +64,21 @@ def check_template(template: str, fields: Collection[str]) -> None:
 
 
 def chunk_and_file(episode: int) -> tuple[int, int]:
-    """Chunk and file index of an episode's own files."""
+    """Chunk and file index of an episode's files."""
     return divmod(episode, FILES_PER_CHUNK)
 
 
 def episode_path(pattern: str, episode: int) -> Path:
-    """Path, within the folder, of an episode's own file."""
+    """Path, within the folder, of an episode's file."""
     chunk, file = chunk_and_file(episode)
     return Path(pattern.format(chunk_index=chunk, file_index=file, video_key=VIDEO_KEY))
 
 
 def axis_names(num_arms: int) -> list[str]:
-    """Names of the ``10·A`` action dimensions on disk, in order; "palm" is the gripper point."""
+    """Names of the ``10·A`` action dimensions on disk, in order; "palm" is the gripper point.
+
+    The name stays, so that existing folders can be read.
+    """
     points = [f"{point}.{axis}" for point in ("palm", "finger_1", "finger_2") for axis in "xyz"]
     names = [*points, "gripper"]
     assert len(names) == ACTION_DIM

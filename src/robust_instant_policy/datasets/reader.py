@@ -1,4 +1,4 @@
-"""Reading demonstrations back."""
+"""Reading demonstrations."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from robust_instant_policy.trajectory import Trajectory
 
 
 def load_demonstrations(path: str | Path, task: str | None = None, limit: int | None = None) -> list[Demonstration]:
-    """The demonstrations of a folder in the order they were recorded, at most ``limit`` of them.
+    """The demonstrations of a folder in recording order, at most ``limit`` of them.
 
-    Trajectories come back to float32, depth to 0.1 mm (1 mm where the camera read beyond 6.5 m) and NaN where
-    there was no reading, everything else exactly. With ``task``, a folder of another task is refused.
+    Trajectories are stored in float32, depth in steps of 0.1 mm (1 mm where the camera read beyond 6.5 m), NaN where
+    there was no reading; everything else exactly. With ``task``, a folder of another task is an error.
     Raises `DatasetError` for a folder that is missing, empty, half-written, damaged or of another task.
     """
     if limit is not None and limit < 1:
@@ -47,13 +47,13 @@ def load_demonstrations(path: str | Path, task: str | None = None, limit: int | 
 
 
 def load_frames(path: str | Path, episode: int) -> Iterator[NDArray[np.uint8]]:
-    """Images ``(H, W, 3)`` uint8 along the way of one episode, one for each step of its trajectory.
+    """Images ``(H, W, 3)`` uint8 of one episode, one for each step of its trajectory.
 
     Raises `DatasetError` when the folder was recorded without images or has no such episode.
     """
     folder = open_folder(Path(path))
     if layout.VIDEO_KEY not in folder.video_keys:
-        raise DatasetError(f"{path} was recorded without images along the way; record it again with images")
+        raise DatasetError(f"{path} was recorded without images; record it again with --images")
     if not 0 <= episode < len(folder.episodes):
         raise DatasetError(f"{path} holds {len(folder.episodes)} episodes, there is no episode {episode}")
     return folder.frames(episode, layout.VIDEO_KEY)

@@ -1,7 +1,7 @@
-"""The statistics that `lerobot` normalises policies with, for each feature of an episode and of a folder.
+"""Statistics for `lerobot`'s normalisation, for each feature of an episode and of a folder.
 
-Its conventions (``src/lerobot/datasets/compute_stats.py`` of 0.4.4): images are counted in [0, 1], channel first, from
-a sample of frames and pixels; the quantiles of a folder are the episodes' own, averaged by their frames.
+Conventions of ``src/lerobot/datasets/compute_stats.py`` of 0.4.4: images are scaled to [0, 1], channel first, and
+sampled in frames and pixels; quantiles of a folder are those of its episodes, averaged with their number of frames.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from robust_instant_policy.geometry import FloatArray
 Statistics = Mapping[str, FloatArray]
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-MAX_FRAMES = 100  # of an episode that count towards image statistics
-MAX_SIDE_PX = 150  # images larger than this are counted at every second, third, … pixel
+MAX_FRAMES = 100  # of an episode, for image statistics
+MAX_SIDE_PX = 150  # larger images are subsampled at every second, third, … pixel
 
 
 def feature_statistics(values: ArrayLike) -> dict[str, FloatArray]:
@@ -43,7 +43,7 @@ def image_statistics(images: NDArray[np.uint8]) -> dict[str, FloatArray]:
 
 
 def combine(parts: Sequence[Statistics]) -> dict[str, FloatArray]:
-    """Statistics of all the frames behind ``parts``."""
+    """Statistics of all frames of ``parts``."""
     stacked = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
     count = stacked.pop("count")
     share = count / count.sum()

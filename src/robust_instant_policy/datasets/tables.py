@@ -1,4 +1,4 @@
-"""The tables of a folder as they are written: frames, episodes, tasks, and what a frame consists of."""
+"""The tables of a folder for writing: frames, episodes, tasks, and the features of a frame."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from robust_instant_policy.trajectory import ACTION_DIM
 
 
 def features_of(num_arms: int, images: NDArray[np.uint8] | None, rate_hz: float) -> dict[str, dict[str, Any]]:
-    """What each frame consists of, in the words of ``meta/info.json``."""
+    """The features of a frame, in the form of ``meta/info.json``."""
     gripper = {"dtype": "float32", "shape": [ACTION_DIM * num_arms], "names": layout.axis_names(num_arms)}
     features: dict[str, dict[str, Any]] = {layout.ACTION_KEY: gripper, layout.STATE_KEY: gripper}
     if images is not None:
@@ -48,7 +48,7 @@ def features_of(num_arms: int, images: NDArray[np.uint8] | None, rate_hz: float)
 
 
 def frame_table(columns: Mapping[str, NDArray]) -> pa.Table:
-    """A row a step; vectors ``(T, D)`` as lists of fixed length."""
+    """One row per step; vectors ``(T, D)`` as lists of fixed length."""
     return pa.table(
         {
             key: pa.FixedSizeListArray.from_arrays(value.ravel(), value.shape[1]) if value.ndim == 2 else value
@@ -58,7 +58,7 @@ def frame_table(columns: Mapping[str, NDArray]) -> pa.Table:
 
 
 def episode_table(row: Mapping[str, Any], statistics: Mapping[str, Statistics]) -> pa.Table:
-    """One row; the types are said, since a missing seed has none and all files must agree."""
+    """One row, with explicit types: a missing seed has none, and all files must have equal types."""
     table = {key: pa.array([value]) for key, value in row.items() if key != layout.SEED_COLUMN}
     table[layout.SEED_COLUMN] = pa.array([row[layout.SEED_COLUMN]], type=pa.int64())
     for key, entries in statistics.items():
@@ -68,7 +68,7 @@ def episode_table(row: Mapping[str, Any], statistics: Mapping[str, Statistics]) 
 
 
 def read_statistics(root: Path, episode: int) -> dict[str, Statistics]:
-    """The statistics that `episode_table` wrote."""
+    """The statistics written by `episode_table`."""
     table = read_table(inside(root, layout.episode_path(layout.EPISODES_PATTERN, episode)))
     result: dict[str, dict[str, FloatArray]] = {}
     for column in table.column_names:
@@ -79,7 +79,7 @@ def read_statistics(root: Path, episode: int) -> dict[str, Statistics]:
 
 
 def listed(statistics: Statistics) -> dict[str, list]:
-    """Statistics as JSON and Parquet have them; counts are whole numbers."""
+    """Statistics as lists for JSON and Parquet; counts are whole numbers."""
     return {
         name: value.astype(np.int64).tolist() if name == "count" else value.tolist()
         for name, value in statistics.items()

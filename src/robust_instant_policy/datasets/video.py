@@ -27,20 +27,20 @@ X264_OPTIONS = {
     "mbtree": "0",
     "rc-lookahead": "0",
 }
-FILM_OPTIONS = {"preset": "veryfast", "crf": "26"}  # to be looked at, in a page: a tenth of the size
+FILM_OPTIONS = {"preset": "veryfast", "crf": "26"}  # for videos in pages: a tenth of the size
 MAX_RATE_DENOMINATOR = 1001  # as in 30000/1001 Hz
 
 
 def rate_fraction(rate_hz: float) -> Fraction:
-    """The rate as the ratio that a video's clock needs."""
+    """The rate as a ratio, for the clock of a video."""
     return Fraction(rate_hz).limit_denominator(MAX_RATE_DENOMINATOR)
 
 
 class VideoEncoder:
-    """Makes an MP4 of images ``(H, W, 3)`` uint8, H and W even, one by one.
+    """Encodes images ``(H, W, 3)`` uint8, H and W even, one by one as MP4.
 
-    The same images give the same bytes every time, and frame t is shown at exactly t / rate. ``options`` are x264's:
-    `X264_OPTIONS` for images that are data, `FILM_OPTIONS` for a film that is only looked at.
+    Equal images give equal bytes, and frame t has the time t / rate. ``options`` are x264's: `X264_OPTIONS` for
+    images that are data, `FILM_OPTIONS` for videos in pages.
     """
 
     def __init__(self, rate_hz: float, options: Mapping[str, str] = X264_OPTIONS):
@@ -55,12 +55,14 @@ class VideoEncoder:
         self.num_images = 0
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Append an image of the size of the first. Raises `InvalidValueError` for any other."""
+        """Append an image. Raises `InvalidValueError` unless it has the size of the first one."""
         height, width = image.shape[:2]
         if self.num_images == 0:
             self._stream.width, self._stream.height = width, height
         if image.dtype != np.uint8 or image.shape != (self._stream.height, self._stream.width, 3):
-            raise InvalidValueError(f"a video needs images alike, (H, W, 3) uint8, got {image.shape} {image.dtype}")
+            raise InvalidValueError(
+                f"a video needs images of one size, (H, W, 3) uint8, got {image.shape} {image.dtype}"
+            )
         if height % 2 or width % 2:
             raise InvalidValueError(f"a video needs images of even height and width, got {width} x {height} pixels")
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
@@ -70,7 +72,7 @@ class VideoEncoder:
         self.num_images += 1
 
     def finish(self) -> bytes:
-        """The whole video; nothing can be added any more."""
+        """The complete video; ends the encoding."""
         if self.num_images:
             self._container.mux(self._stream.encode(None))
         self._container.close()
@@ -78,7 +80,7 @@ class VideoEncoder:
 
 
 class VideoWriter:
-    """Writes a video to ``path`` when closed, whole; no file, and none from before, where no image came.
+    """Writes a video to ``path`` atomically when closed; without images, an existing file is removed.
 
     >>> with VideoWriter("run.mp4", fps=20) as video:
     ...     task.execute(trajectory, on_frame=video.add)
@@ -98,7 +100,7 @@ class VideoWriter:
         self.close()
 
     def close(self) -> None:
-        """Write the file. Raises `DatasetError` when that is not possible."""
+        """Write the file. Raises `DatasetError` if that is not possible."""
         content = self._encoder.finish()
         if content:
             write_whole(self._path, content)
@@ -117,10 +119,10 @@ def encode_video(images: NDArray[np.uint8], rate_hz: float) -> bytes:
 def decode_video(path: Path, start_s: float = 0.0, stop_s: float = float("inf")) -> Iterator[NDArray[np.uint8]]:
     """Frames ``(H, W, 3)`` uint8 of ``path`` shown within ``[start_s, stop_s)``.
 
-    Raises `DatasetError` for a file that is not there or not a video.
+    Raises `DatasetError` for a missing file or another format.
     """
     try:
-        # As a file object and as MP4 only: other formats of FFmpeg name files and addresses that it would open.
+        # As a file object and as MP4 only: other formats of FFmpeg may refer to other files and addresses.
         with open_regular(path) as file, av.open(file, format="mp4") as container:
             stream = container.streams.video[0]
             if stream.width * stream.height > MAX_PIXELS:

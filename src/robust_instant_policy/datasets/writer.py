@@ -1,4 +1,4 @@
-"""Recording demonstrations, so that being killed at any moment loses at most the episode under way."""
+"""Recording demonstrations; a process that is killed loses at most the current episode."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ EPISODE_FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.(?:parquet|png|mp4)$")
 
 
 class DatasetWriter:
-    """Adds demonstrations to a folder; makes it, or goes on where an earlier writer stopped.
+    """Adds demonstrations to a new folder, or to one of an earlier writer.
 
-    All episodes share one ``task``, its ``description`` in words, and the recording rate. An episode is finished
-    once ``meta/info.json`` counts it: its files are written first, that one last, each of them whole or not at all.
-    So a killed process leaves at most files that nobody counts, and the next writer removes them.
+    All episodes have one ``task``, its ``description`` in words, and one recording rate. An episode is finished
+    when ``meta/info.json`` counts it: its files are written first, ``info.json`` last, each of them atomically.
+    A killed process leaves at most uncounted files, and the next writer removes them.
 
-    Raises `DatasetError` for a folder of another task or rate, one that holds something else, one that another
-    process is writing to, and when the disk is full.
+    Raises `DatasetError` for a folder of another task or rate, one with other content, one that another
+    process is writing to, and if the disk is full.
     """
 
     def __init__(self, path: str | Path, task: str, description: str, rate_hz: float):
@@ -83,36 +83,36 @@ class DatasetWriter:
         self.close()
 
     def close(self) -> None:
-        """Let other processes write to the folder. Everything added is on the disk already."""
+        """Release the folder for other processes. All added episodes are already on the disk."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
 
     @property
     def num_episodes(self) -> int:
-        """Episodes finished, those of earlier writers included."""
+        """Number of finished episodes, including those of earlier writers."""
         return 0 if self._folder is None else len(self._folder.episodes)
 
     @property
     def discarded(self) -> int:
-        """Attempts thrown away, those of earlier writers included."""
+        """Number of discarded attempts, including those of earlier writers."""
         return len(self._discarded_seeds)
 
     @property
     def last_seed(self) -> int | None:
-        """The largest seed tried so far, kept or thrown away; the next one to try is one more."""
+        """The largest seed tried so far, stored or discarded; the next seed is one larger."""
         kept = [] if self._folder is None else [read_seed(row) for row in self._folder.episodes]
         return max((seed for seed in [*kept, *self._discarded_seeds] if seed is not None), default=None)
 
     def discard(self, seed: int | None = None) -> None:
-        """Remember that an attempt, of ``seed`` if it had one, was thrown away."""
+        """Record a discarded attempt, with its ``seed`` if it had one."""
         self._require_open()
         self._write_own([*self._discarded_seeds, seed])
 
     def add(self, demonstration: Demonstration, images: NDArray[np.uint8] | None = None) -> None:
-        """Append an episode, with ``images (T, H, W, 3)`` uint8 along the way for all episodes or for none.
+        """Append an episode, with ``images (T, H, W, 3)`` uint8 of all steps for all episodes or for none.
 
-        When this returns, the episode is on the disk; when it raises, the folder is as it was before.
+        When this returns, the episode is on the disk; when it raises, the folder is unchanged.
         """
         self._require_open()
         self._check(demonstration, images)
@@ -124,10 +124,10 @@ class DatasetWriter:
 
     def _require_open(self) -> None:
         if self._lock is None:
-            raise DatasetError(f"the writer of {self.path} is closed; open a new one to go on")
+            raise DatasetError(f"the writer of {self.path} is closed; open a new one")
 
     def _resume(self) -> None:
-        """Take up what earlier writers finished, and remove what they did not."""
+        """Read the finished episodes of earlier writers, and remove unfinished files."""
         if (self.path / layout.RIP_PATH).exists():
             own = read_recording(self.path)
             if own["task"] != self.task:
@@ -149,7 +149,7 @@ class DatasetWriter:
         self._write_own([])
 
     def _take_up(self) -> None:
-        """Know what is finished, and remove what is not."""
+        """Read the finished episodes, and remove unfinished files."""
         self._folder, self._statistics = None, {}
         if (self.path / layout.INFO_PATH).exists():
             self._folder = open_folder(self.path, self.task)
@@ -164,7 +164,7 @@ class DatasetWriter:
         self._remove_unfinished(self.num_episodes)
 
     def _remove_unfinished(self, count: int) -> None:
-        """Remove the files of episode ``count``, the one under way; those of any other mean damage, and stay."""
+        """Remove the files of the unfinished episode ``count``; files of any later episode are an error and stay."""
         unfinished = []
         for file in (file for top in (*layout.EPISODE_FOLDERS, "meta") for file in inside(self.path, top).rglob("*")):
             match = EPISODE_FILE.search(file.as_posix())
@@ -191,7 +191,7 @@ class DatasetWriter:
         self._discarded_seeds = discarded_seeds
 
     def _check(self, demonstration: Demonstration, images: NDArray[np.uint8] | None) -> None:
-        """Refuse, before anything is written, what the folder cannot hold."""
+        """Raise an error, before anything is written, for what the folder cannot hold."""
         trajectory = demonstration.trajectory
         if demonstration.task not in ("", self.task):
             raise DatasetError(f"a demonstration of {demonstration.task!r} cannot go into {self.path} of {self.task!r}")
@@ -219,7 +219,7 @@ class DatasetWriter:
     def _write_episode(
         self, demonstration: Demonstration, images: NDArray[np.uint8] | None
     ) -> tuple[Folder, dict[str, Statistics]]:
-        """Write an episode, its own files first; the folder and its statistics with it."""
+        """Write an episode, its own files first; returns the folder and statistics with it."""
         episode = self.num_episodes
         first_frame = 0 if self._folder is None else self._folder.info["total_frames"]
         length = len(demonstration.trajectory)
@@ -271,7 +271,7 @@ class DatasetWriter:
         }
 
     def _write_start(self, demonstration: Demonstration, episode: int) -> dict[str, Any]:
-        """Write the start-of-episode images; the columns say the rest of what was known at the start."""
+        """Write the start-of-episode images; returns the columns for the other data of the start."""
         observation = demonstration.observation
         depth, unit = encode_depth(observation.depth)
         self._write_file(layout.START_RGB_PATTERN, episode, encode_png(observation.rgb))
@@ -287,7 +287,7 @@ class DatasetWriter:
     def _write_dataset(
         self, features: dict[str, Any], statistics: Mapping[str, Statistics], num_episodes: int, num_frames: int
     ) -> dict[str, Any]:
-        """Write the files that speak of the whole folder; the last one, whose content is returned, finishes it."""
+        """Write the files about the whole folder; the last one, whose content is returned, finishes the episode."""
         info = {
             "codebase_version": layout.CODEBASE_VERSION,
             "robot_type": None,
@@ -314,7 +314,7 @@ class DatasetWriter:
 
 
 def _combined(earlier: Mapping[str, Statistics], statistics: Mapping[str, Statistics]) -> dict[str, Statistics]:
-    """One episode more; episodes are always taken in one by one, so that a resumed folder gets the same numbers."""
+    """Statistics with one more episode; one by one, so that a resumed folder gets equal numbers."""
     if not earlier:
         return dict(statistics)
     return {key: combine([earlier[key], statistics[key]]) for key in statistics}
@@ -325,7 +325,7 @@ def _json(content: dict[str, Any]) -> bytes:
 
 
 def _number(value: object) -> object:
-    """NumPy's numbers as JSON has them."""
+    """NumPy numbers as JSON numbers."""
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"an episode's info holds strings and numbers, not {type(value).__name__}")

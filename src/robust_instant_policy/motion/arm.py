@@ -1,4 +1,4 @@
-"""What motion planning has to know of an arm, and the commands that it makes for one or more of them."""
+"""The model of an arm for motion planning, and the commands for one or more arms."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Commands for A arms, one a control step: joint angles ``(N, A, J)`` rad, finger travel ``(N, A)`` m.
+    """Commands for A arms, one per control step: joint angles ``(N, A, J)`` rad, finger travel ``(N, A)`` m.
 
     ``poses (N, A, 4, 4)`` and ``closed (N, A)`` bool are the tool poses and gripper states that the commands realise.
     """
@@ -60,5 +60,5 @@ class Motion:
 
     @property
     def commands(self) -> FloatArray:
-        """``(N, A·(J + 1))``: of one arm after the other the joint angles and the finger travel."""
+        """``(N, A·(J + 1))``: for each arm, the joint angles and the finger travel."""
         return np.concatenate([self.joints, self.fingers[..., None]], axis=-1).reshape(len(self.joints), -1)

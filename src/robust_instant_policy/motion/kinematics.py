@@ -12,17 +12,17 @@ from numpy.typing import ArrayLike
 
 from robust_instant_policy.geometry import FloatArray, invert_pose
 
-MAX_ITERATIONS = 30  # per pose; along a path two or three are enough
+MAX_ITERATIONS = 30  # per pose; two or three suffice along a path
 CONVERGED_M = 1e-4
 CONVERGED_RAD = 1e-3
-LEVENBERG_MARQUARDT = 1e-4  # keeps steps bounded near singular poses
+LEVENBERG_MARQUARDT = 1e-4  # bounds the steps near singular poses
 DAMPING = 1e-6
-ORIENTATION_COST = 0.3  # metres per radian: about the hand's own length
+ORIENTATION_COST = 0.3  # metres per radian, about the length of the gripper
 
 
 @dataclass(frozen=True, eq=False)
 class JointPath:
-    """Joint angles ``(N, J)`` rad with what they miss: ``position_error (N,)`` m, ``rotation_error (N,)`` rad."""
+    """Joint angles ``(N, J)`` rad and their tool errors: ``position_error (N,)`` m, ``rotation_error (N,)`` rad."""
 
     joints: FloatArray
     position_error: FloatArray
@@ -32,10 +32,10 @@ class JointPath:
 class Kinematics:
     """An arm whose first ``num_joints`` joints, in the order of ``model``, move the frame ``tool``.
 
-    ``tool`` names a ``kind`` ("body" or "site") of the model; ``base (4, 4)`` is where the model's origin stands in
-    the world. ``orientation_cost`` says how many metres off a tool turned by a radian counts as. A
-    ``posture_cost``, in the same unit, keeps joints close to where they are: near a singular pose the tool then
-    turns a little less than asked for, where without it a joint would swing round.
+    ``tool`` names a ``kind`` ("body" or "site") of the model; ``base (4, 4)`` is the pose of the model's origin in
+    the world. ``orientation_cost``, metres per radian, weighs orientation against position errors. A
+    ``posture_cost``, in the same unit, penalises joint motion: near a singular pose the tool then has a small
+    orientation error instead of a large joint motion.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Kinematics:
         return self._base @ self._configuration.get_transform_frame_to_world(self._tool, self._kind).as_matrix()
 
     def follow(self, poses: ArrayLike, start: ArrayLike) -> JointPath:
-        """Joint angles along tool ``poses (N, 4, 4)``, each solved from the one before, the first from ``start``."""
+        """Joint angles along tool ``poses (N, 4, 4)``, each solved from the previous one, the first from ``start``."""
         poses = np.asarray(poses, dtype=np.float64)
         self._place(start)
         local = invert_pose(self._base) @ poses

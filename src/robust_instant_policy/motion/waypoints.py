@@ -1,9 +1,9 @@
 """Waypoint timing: from a trajectory to joint commands at the control rate.
 
-home ──lead-in──▶ waypoint 0 ──1/rate──▶ waypoint 1 ──▶ … ──▶ last ──settle──▶ judged
+home ──lead-in──▶ waypoint 0 ──1/rate──▶ waypoint 1 ──▶ … ──▶ last ──settle──▶ success is judged
                                  └ dwell where a gripper's state changes
 
-All arms of a task share one clock: the slowest of them sets the time of a leg.
+All arms of a task share one clock: the slowest arm determines the duration of a segment.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from robust_instant_policy.motion.checks import check_clearance, check_joint_cha
 from robust_instant_policy.trajectory import Trajectory
 
 LEAD_IN_SPEED_M_S = 0.35  # from home to the first waypoint
-GRIPPER_SECONDS = 0.45  # to open or close fully, with a margin
+GRIPPER_SECONDS = 0.45  # to open or close completely, with a margin
 SETTLE_SECONDS = 0.5  # at the last waypoint, before success is judged
 CLOSED = 0.5  # gripper states above this count as closed
 
 
 def plan_waypoints(trajectory: Trajectory, arms: Sequence[Arm], execute_hz: float, rate_hz: float) -> Motion:
-    """Motion from home along ``trajectory``'s waypoints at ``execute_hz``, with a dwell where a gripper acts.
+    """Motion from home along ``trajectory``'s waypoints at ``execute_hz``, and a dwell at gripper changes.
 
-    Raises `UnreachableError` naming the first waypoint that an arm cannot or must not reach.
+    Raises `UnreachableError` that names the first refused waypoint.
     """
     waypoints = gripper_poses(trajectory, arms)
     schedule = _Schedule(np.stack([arm.home_pose for arm in arms]), 1 / execute_hz)
     first = waypoints[0]
-    over = first.copy()  # travel at the height of the higher one, then go down
+    over = first.copy()  # travel at the larger of the two heights, then descend
     over[:, 2, 3] = np.maximum(schedule.poses[-1][:, 2, 3], first[:, 2, 3])
     for poses in (over, first):
         schedule.go(poses, 0, LEAD_IN_SPEED_M_S)
@@ -58,9 +58,9 @@ def plan_waypoints(trajectory: Trajectory, arms: Sequence[Arm], execute_hz: floa
 def plan_onward(
     waypoints: ArrayLike, waypoint_hz: float, before: Motion, arms: Sequence[Arm], rate_hz: float
 ) -> Motion:
-    """Motion from the end of the one ``before`` through ``waypoints (N, 10·A)``, one every ``1 / waypoint_hz`` seconds.
+    """Motion from the end of ``before`` through ``waypoints (N, 10·A)``, one every ``1 / waypoint_hz`` seconds.
 
-    Legs longer than a tool may go in that time take longer; there is no dwell on gripper changes.
+    Segments above the tool's speed limit take longer; there is no dwell on gripper changes.
     Raises `UnreachableError` like `plan_waypoints`.
     """
     trajectory = Trajectory.from_actions(waypoints)
@@ -78,8 +78,8 @@ def plan_onward(
 class _Schedule:
     """Tool poses ``(A, 4, 4)`` at increasing times, from ``start`` at time 0 with open grippers.
 
-    ``interval`` is the time between waypoints in seconds; ``closed (A,)`` the gripper command from each time on,
-    ``steps`` the waypoint that each set of poses belongs to.
+    ``interval`` is the time between waypoints in seconds; ``closed (A,)`` the gripper command from each time on;
+    ``steps`` the waypoint index of each set of poses.
     """
 
     def __init__(self, start: FloatArray, interval: float):
@@ -88,12 +88,12 @@ class _Schedule:
         self.closed: list[np.ndarray] = [np.zeros(len(start), dtype=bool)]
 
     def go(self, poses: FloatArray, step: int, speed: float) -> None:
-        """Go on to ``poses`` in the time between waypoints, or slower where that would take more than ``speed`` m/s."""
+        """Move to ``poses`` in one interval, or longer if that would exceed ``speed`` m/s."""
         distance = float(np.linalg.norm(poses[:, :3, 3] - self.poses[-1][:, :3, 3], axis=1).max())
         self._add(poses, max(self._interval, distance / speed), step)
 
     def dwell(self, seconds: float, closed: np.ndarray) -> None:
-        """Stay for ``seconds``, with the grippers commanded ``closed (A,)`` from the beginning."""
+        """Stay for ``seconds``, with the gripper command ``closed (A,)`` from the start."""
         self.closed[-1] = closed
         self._add(self.poses[-1], seconds, self.steps[-1])
 
@@ -112,10 +112,10 @@ def plan_poses(
     steps: np.ndarray | None = None,
     before: Motion | None = None,
 ) -> Motion:
-    """Motion through tool ``poses (N, A, 4, 4)`` at ``rate_hz``, slowed down where a joint would be too fast.
+    """Motion through tool ``poses (N, A, 4, 4)`` at ``rate_hz``, slowed down at the joints' speed limits.
 
-    ``closed (N, A)`` is the gripper command, ``steps (N,)`` the waypoint that poses lead to, for the error messages.
-    It starts where the motion ``before`` ends, or at home.
+    ``closed (N, A)`` is the gripper command, ``steps (N,)`` the next waypoint of each pose, for error messages.
+    The motion starts at the end of the motion ``before``, or at home.
     """
     before = Motion.at_home(arms) if before is None else before
     steps = np.arange(len(poses)) if steps is None else steps

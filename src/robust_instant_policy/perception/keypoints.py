@@ -1,4 +1,4 @@
-"""K points that all demonstrations share, and their places in a new image (Oh et al. 2025, Sec. IV-A)."""
+"""K points that all demonstrations share, and their places in a new image (Oh et al. 2025, Sec. III-A)."""
 
 from __future__ import annotations
 

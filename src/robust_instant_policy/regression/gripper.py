@@ -70,7 +70,7 @@ def robust_gripper_trajectory(
     """The robust gripper trajectory of ``candidates``, each ``(T_q, 10·A)``: three points (m) and the state, per arm.
 
     ``estimator`` is "em", "network" (the paper's; "network-sim" and "network-real" train it exactly by the columns of
-    its parameter table), "mixture" (one whole way of several) or "median" (of each number at each step, as a
+    its Table II), "mixture" (one whole way of several) or "median" (of each number at each step, as a
     reference); ``dof`` = inf is the Gaussian ablation, the mean of the candidates. ``times`` are the candidates' own,
     within [0, 1], evenly spread by default; the result has ``num_steps`` steps, by default the median of the
     candidates'. ``triangle`` is the gripper, by default measured from the candidates. ``seed`` is the network's.

@@ -42,7 +42,7 @@ MAX_SEED = 2**63  # torch's generator takes no more
 
 @dataclass(frozen=True)
 class Recipe:
-    """One column of the paper's parameter table."""
+    """One column of the paper's Table II."""
 
     steps: int
     learning_rate: float

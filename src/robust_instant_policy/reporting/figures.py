@@ -221,7 +221,7 @@ def _downsampling(summary: Summary) -> Figure:
 
 
 def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan]) -> Figure:
-    """Gripper point over time where RIP and the Gaussian average differ most (Oh et al. 2025, Fig. 4a)."""
+    """Gripper point over time where RIP and the Gaussian average differ most (Oh et al. 2025, Fig. 5a)."""
     figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
     by_scene: dict[Scene, dict[str, Plan]] = {}
     for (scene, variant), plan in plans.items():

@@ -1,6 +1,6 @@
-"""Scenes with a robot in them and a person who can show what to do.
+"""Tasks: a scene, a robot and a demonstrator.
 
-`make_task` makes one by name; the simulators are imported only then.
+`make_task` makes one by name and imports its simulator.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ TASK_NAMES = tuple(name for family in FAMILIES for name in family.names)
 def make_task(name: str, objects: str = "seen", assets: str = "code") -> Task:
     """The task called ``name``, one of `TASK_NAMES`.
 
-    ``objects="unseen"`` takes objects that no demonstration shows, for the tasks that have two sets;
-    ``assets="maniskill"`` takes YCB and PartNet-Mobility models, where they have been downloaded for ManiSkill.
+    ``objects="unseen"`` uses objects that no demonstration shows, for tasks with two sets;
+    ``assets="maniskill"`` uses YCB and PartNet-Mobility models, if they have been downloaded for ManiSkill.
 
-    Raises `UnknownNameError` for other names, `MissingExtraError` where its simulator is not installed, and
-    `RendererError` where nothing can render its camera.
+    Raises `UnknownNameError` for other names, `MissingExtraError` if its simulator is not installed, and
+    `RendererError` if its camera cannot be rendered.
     """
     if name not in TASK_NAMES:
         raise UnknownNameError("task", name, TASK_NAMES)

@@ -1,4 +1,4 @@
-"""A banana: its curve, its skin and its colours, in a family of sizes and ripeness."""
+"""Bananas of random size, curvature and ripeness: shape, mesh and texture."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from robust_instant_policy.geometry import FloatArray
 
 RINGS, SIDES = 48, 30
-CAPSULES = 8  # that stand for it in contacts
-RIDGE = 0.05  # of the radius: five blunt edges run along the fruit
+CAPSULES = 8  # of its contact shape
+RIDGE = 0.05  # height of the five longitudinal ridges, relative to the radius
 STEM_RADIUS_M = 0.0055
 STEM_SHARE, TIP_SHARE = 0.13, 0.06  # of the length
 TEXTURE_LENGTH, TEXTURE_AROUND = 256, 96
@@ -25,7 +25,7 @@ SPOT_BROWN = (0.42, 0.26, 0.08)
 
 @dataclass(frozen=True)
 class Banana:
-    """Lies in the xy plane, bent towards +y, its middle at the origin and its middle's long axis along x.
+    """A banana in the xy plane, curved towards +y, its middle at the origin with the long axis along x.
 
     ``length`` along the curve and ``radius`` of its thickest part in metres, ``bend`` the angle between its ends
     in rad, ``ripeness`` 0 (greenish) to 1 (spotted).
@@ -48,21 +48,21 @@ class Banana:
         )
 
     def centreline(self, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points ``(N, 3)`` and tangents ``(N, 3)`` at shares ``along (N,)`` of the length, -0.5 (stem) to 0.5."""
+        """Points ``(N, 3)`` and tangents ``(N, 3)`` at relative positions ``along (N,)``, -0.5 (stem) to 0.5."""
         turn, bend_radius = along * self.bend, self.length / self.bend
         zero = np.zeros_like(turn)
         points = np.stack([bend_radius * np.sin(turn), bend_radius * (1 - np.cos(turn)), zero], axis=1)
         return points, np.stack([np.cos(turn), np.sin(turn), zero], axis=1)
 
     def thickness(self, along: FloatArray) -> FloatArray:
-        """Radius ``(N,)`` at shares ``along (N,)``: a long belly, a thin stem, a blunt tip."""
+        """Radius ``(N,)`` at relative positions ``along (N,)``: a thin stem, a thick middle, a blunt tip."""
         from_stem, from_tip = along + 0.5 - STEM_SHARE, 0.5 - along
         belly = self.radius * np.sqrt(np.clip(1 - np.abs(2 * along / 1.02) ** 5, 0.0, 1.0))
         neck = STEM_RADIUS_M + (belly - STEM_RADIUS_M) * _ease(from_stem / 0.16)
         return np.minimum(neck, 0.004 + self.radius * np.sqrt(np.clip(from_tip / 0.11, 0.0, 1.0)))
 
     def capsules(self) -> list[tuple[FloatArray, FloatArray, float]]:
-        """Ends ``(3,)``, ``(3,)`` and radius of each of the capsules that touch other things."""
+        """Ends ``(3,)``, ``(3,)`` and radius of each capsule of the contact shape."""
         edges = np.linspace(-0.5 + STEM_SHARE, 0.5 - TIP_SHARE, CAPSULES + 1)
         points, _ = self.centreline(edges)
         radius = self.thickness((edges[1:] + edges[:-1]) / 2)

@@ -1,4 +1,4 @@
-"""What a stereo depth camera makes of a scene that a simulator renders perfectly.
+"""Noise model of a stereo depth camera, applied to rendered images.
 
 Numbers follow the Intel RealSense D415: 55 mm between its imagers, about 920 pixels of focal length at 1280×720,
 a matching error of about 0.08 pixels, disparities in 1/32 pixel, readings in millimetres, zero where there is none.
@@ -17,16 +17,16 @@ from robust_instant_policy.demonstration import Observation
 FOCAL_BASELINE_M_PX = 920 * 0.055  # disparity in pixels = this / depth in metres
 UNIT_M = 0.001  # one count of the depth image
 EDGE_JUMP = 0.02  # share of the depth; neighbours that differ by more are on two surfaces
-SHINY = 0.97  # brightness, of 1, at which the projected pattern drowns
+SHINY = 0.97  # brightness, of 1, above which the projected pattern is not visible
 
 
 @dataclass(frozen=True)
 class CameraNoise:
-    """A camera that is not perfect; `photograph` applies it.
+    """Parameters of the noise; `photograph` applies it.
 
-    ``matching_error`` and ``disparity_step`` in pixels of disparity, so that depth's noise and steps grow with the
-    square of the distance; ``correlation`` in pixels, the size of the noise's blotches; ``edge_holes`` and
-    ``flying_pixels``: shares of the pixels at depth edges that give no reading, or one between the two surfaces;
+    ``matching_error`` and ``disparity_step`` in pixels of disparity, so that noise and steps of the depth grow with
+    the square of the distance; ``correlation`` in pixels, the correlation length of the noise; ``edge_holes`` and
+    ``flying_pixels``: shares of the pixels at depth edges without a reading, or with one between the two surfaces;
     ``shiny_holes``: share of overexposed pixels without a reading; ``colour_noise`` of a channel's range.
     """
 
@@ -39,7 +39,7 @@ class CameraNoise:
     colour_noise: float = 0.01
 
     def photograph(self, observation: Observation, seed: int) -> Observation:
-        """``observation`` as this camera would have taken it; the same ``seed`` gives the same noise."""
+        """``observation`` with the noise of ``seed``."""
         rng = np.random.default_rng(seed)
         colour = observation.rgb + rng.normal(0, 255 * self.colour_noise, observation.rgb.shape)
         return Observation(

@@ -1,6 +1,6 @@
-"""A person's hands on leader arms: strokes with their own path, speed, pauses and small errors.
+"""A model of human demonstrations with leader arms: strokes with random path, speed, pauses and errors.
 
-An expert says what to do as `Stroke`s; `perform` says how this person does it this time. Strokes between rests
+An expert lists the `Stroke`s; `perform` executes them with the variation of one episode. Strokes between rests
 follow the minimum-jerk profile of human reaching (Flash and Hogan 1985).
 """
 
@@ -15,29 +15,28 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from robust_instant_policy.geometry import FloatArray
 
-SPEED_SPREAD = 0.15  # of the log of an episode's and a stroke's speed
+SPEED_SPREAD = 0.15  # standard deviation of the log of an episode's and a stroke's speed
 MIN_STROKE_S = 0.35
-TURN_RADIUS_M = 0.12  # a turn of one radian takes as long as this many metres
-SKEW_SPREAD = 0.12  # of the log of the exponent that makes strokes start or end faster
-BOW_SHARE = 0.06  # of its length: how far a free stroke bows out from the straight line
-BOW_UP_SHARE = 0.05  # and how far it arches on average, as a hand lifts to travel
+TURN_RADIUS_M = 0.12  # a rotation by one radian takes as long as this distance
+SKEW_SPREAD = 0.12  # standard deviation of the log of the exponent that skews the speed profile
+BOW_SHARE = 0.06  # lateral deviation of a free stroke from the straight line, relative to its length
+BOW_UP_SHARE = 0.05  # mean upward deviation of a free stroke, relative to its length
 HESITATION_CHANCE, HESITATION_S = 0.15, (0.15, 0.45)
 AIM_ERROR_RAD = 0.02
 TREMOR_M = 0.0004
 TREMOR_HZ = (0.6, 3.5)
 TREMOR_WAVES = 4
-GRIP_PAUSE_S = (0.4, 0.65)  # the person watches the fingers close
+GRIP_PAUSE_S = (0.4, 0.65)  # the demonstrator waits for the fingers
 
 
 @dataclass(frozen=True, eq=False)
 class Stroke:
     """One movement from rest to rest through tool ``poses (N, 4, 4)``, stopping at the last.
 
-    ``error`` is the spread, in metres, with which the person hits the last position; ``speed`` the usual mean
-    speed in m/s; ``pause`` the usual rest afterwards in seconds; ``closed`` the gripper state from then on.
-    A ``free`` stroke touches nothing and may bow out on its way. ``hand`` is the one that makes the stroke, by its
-    place among the task's end-effectors; hands move at the same time, but a stroke that ``waits`` begins only when
-    all strokes named before it are done.
+    ``error`` is the spread, in metres, of the last position; ``speed`` the typical mean speed in m/s; ``pause`` the
+    typical rest afterwards in seconds; ``closed`` the gripper state after the stroke. A ``free`` stroke touches nothing
+    and may deviate from the straight line. ``arm`` is the index of the arm among the task's end-effectors; arms move
+    at the same time, but a stroke that ``waits`` begins after all strokes listed before it.
     """
 
     poses: FloatArray
@@ -46,7 +45,7 @@ class Stroke:
     error: float = 0.002
     pause: float = 0.08
     free: bool = False
-    hand: int = 0
+    arm: int = 0
     waits: bool = False
 
 
@@ -54,38 +53,38 @@ def perform(
     starts: FloatArray, strokes: Sequence[Stroke], rng: np.random.Generator, rate_hz: float
 ) -> tuple[FloatArray, np.ndarray]:
     """Tool poses ``(T, A, 4, 4)`` and gripper commands ``(T, A)`` bool at ``rate_hz``, from ``starts (A, 4, 4)`` with
-    open hands."""
+    open grippers."""
     pace = np.exp(rng.normal(0.0, SPEED_SPREAD))
-    hands = [_Hand(start) for start in starts]
+    motions = [_ArmMotion(start) for start in starts]
     for stroke in strokes:
-        hand = hands[stroke.hand]
+        motion = motions[stroke.arm]
         if stroke.waits:
-            hand.rest_until(max(len(other) for other in hands))
-        path = _move(hand.pose, stroke, pace, rng, rate_hz)
+            motion.rest_until(max(len(other) for other in motions))
+        path = _move(motion.pose, stroke, pace, rng, rate_hz)
         rest = stroke.pause * rng.uniform(0.3, 1.7)
         if rng.random() < HESITATION_CHANCE:
             rest += rng.uniform(*HESITATION_S)
-        hand.follow(path)
-        if stroke.closed != hand.shut:
-            hand.shut = stroke.closed
+        motion.follow(path)
+        if stroke.closed != motion.command:
+            motion.command = stroke.closed
             rest += rng.uniform(*GRIP_PAUSE_S)
-        hand.rest_until(len(hand) + round(rest * rate_hz))
-    for hand in hands:
-        hand.rest_until(max(len(other) for other in hands))
-    whole = np.stack([hand.poses for hand in hands], axis=1)
-    for arm in range(len(hands)):
-        whole[:, arm, :3, 3] += _tremor(len(whole), rng, rate_hz)
-    return whole, np.stack([hand.closed for hand in hands], axis=1)
+        motion.rest_until(len(motion) + round(rest * rate_hz))
+    for motion in motions:
+        motion.rest_until(max(len(other) for other in motions))
+    whole = np.stack([motion.poses for motion in motions], axis=1)
+    for index in range(len(motions)):
+        whole[:, index, :3, 3] += _tremor(len(whole), rng, rate_hz)
+    return whole, np.stack([motion.closed for motion in motions], axis=1)
 
 
-class _Hand:
-    """What one hand has done so far: ``poses (T, 4, 4)``, each with the gripper command ``closed (T,)`` bool of then.
+class _ArmMotion:
+    """The motion of one arm so far: ``poses (T, 4, 4)`` and gripper commands ``closed (T,)`` bool.
 
-    ``shut`` is the command from now on.
+    ``command`` is the gripper command of further poses.
     """
 
     def __init__(self, start: FloatArray):
-        self.poses, self.closed, self.shut = start[None], np.zeros(1, dtype=bool), False
+        self.poses, self.closed, self.command = start[None], np.zeros(1, dtype=bool), False
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -96,7 +95,7 @@ class _Hand:
 
     def follow(self, path: FloatArray) -> None:
         self.poses = np.concatenate([self.poses, path])
-        self.closed = np.append(self.closed, np.full(len(path), self.shut))
+        self.closed = np.append(self.closed, np.full(len(path), self.command))
 
     def rest_until(self, length: int) -> None:
         self.follow(np.repeat(self.pose[None], length - len(self), axis=0))
@@ -104,7 +103,7 @@ class _Hand:
 
 def _move(here: FloatArray, stroke: Stroke, pace: float, rng: np.random.Generator, rate_hz: float) -> FloatArray:
     knots = np.concatenate([here[None], stroke.poses])
-    knots[1:, :3, 3] += rng.normal(0.0, stroke.error, 3)  # a drawn curve is missed as a whole, not point by point
+    knots[1:, :3, 3] += rng.normal(0.0, stroke.error, 3)  # one error for the whole curve, not one per point
     if stroke.free:
         knots = np.insert(knots, 1, _bow(knots[0], knots[1], rng), axis=0)
     turn = Rotation.from_rotvec(rng.normal(0.0, AIM_ERROR_RAD, 3)).as_matrix()
@@ -124,7 +123,7 @@ def _move(here: FloatArray, stroke: Stroke, pace: float, rng: np.random.Generato
 
 
 def _bow(start: FloatArray, stop: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """A pose ``(4, 4)`` half way, off the straight line."""
+    """A pose ``(4, 4)`` half-way, beside the straight line."""
     length = float(np.linalg.norm(stop[:3, 3] - start[:3, 3]))
     middle = stop.copy()
     middle[:3, 3] = (start[:3, 3] + stop[:3, 3]) / 2 + length * rng.normal(0.0, BOW_SHARE, 3)
@@ -134,7 +133,7 @@ def _bow(start: FloatArray, stop: FloatArray, rng: np.random.Generator) -> Float
 
 
 def _tremor(length: int, rng: np.random.Generator, rate_hz: float) -> FloatArray:
-    """Small unsteadiness ``(length, 3)`` in metres, none at the first sample."""
+    """Tremor ``(length, 3)`` in metres, 0 at the first sample."""
     time = np.arange(length) / rate_hz
     waves = np.zeros((length, 3))
     for _ in range(TREMOR_WAVES):

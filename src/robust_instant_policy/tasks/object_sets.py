@@ -1,4 +1,4 @@
-"""Sets of objects: the ones that demonstrations are made with, and others that they never show."""
+"""Two sets of objects: those of the demonstrations, and those that no demonstration shows."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ T = TypeVar("T")
 def draw_object(
     families: Mapping[str, Callable[[int, np.random.Generator], T]], objects: str, rng: np.random.Generator
 ) -> T:
-    """One of the `OBJECTS_A_SET` objects of the set ``objects``, which are the same ones in every episode.
+    """One of the `OBJECTS_A_SET` objects of the set ``objects``, which are the same in every episode.
 
-    ``families[objects](number, rng)`` makes the object of that number; its random numbers are always the same.
+    ``families[objects](number, rng)`` makes the object with that number; ``rng`` depends on the number only.
     """
     number = int(rng.integers(OBJECTS_A_SET))
     return families[objects](number, np.random.default_rng([number, *objects.encode()]))

@@ -1,4 +1,4 @@
-"""Picking an object up from the table with any arm: the strokes, and why it failed."""
+"""Picking an object from the table: the strokes, and the reason of a failure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.poses import downward
 
-LIFT_SPREAD_M = 0.02  # people lift higher one time and less high another
+LIFT_SPREAD_M = 0.02  # of the lift height between episodes
 GRASP_ERROR_M = 0.0015
 
 
@@ -27,7 +27,7 @@ class Pick:
     error: float
 
     def strokes(self, pose: FloatArray, rng: np.random.Generator) -> list[Stroke]:
-        """Come down over what lies at ``pose (4, 4)``, fingers across its x axis, close, lift and hold."""
+        """Descend to the object at ``pose (4, 4)`` with the fingers across its x axis, close, lift and hold."""
         x, y = pose[:2, 3].tolist()
         yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
         lift = self.lift + rng.uniform(-LIFT_SPREAD_M, LIFT_SPREAD_M)
@@ -40,7 +40,7 @@ class Pick:
 
 
 def failure_of_pick(what: str, lifted: bool, held: bool, still: bool) -> str:
-    """Why ``what`` was not picked, in words; nothing where it is held ``still`` above the table."""
+    """Reason why ``what`` was not picked; empty if it is held ``still`` above the table."""
     if not held:
         return f"the {what} slipped out of the fingers" if lifted else f"the fingers hold no {what}"
     if not lifted:

@@ -1,4 +1,4 @@
-"""Tool poses that experts ask for."""
+"""Tool poses for experts."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ def downward(x: float, y: float, z: float, yaw: float = 0.0) -> FloatArray:
 
 
 def facing(x: float, y: float, yaw: float) -> FloatArray:
-    """Frame on the table at ``(x, y)`` m, turned by ``yaw`` rad; at 0 its -x axis points to the robot."""
+    """Frame on the table at ``(x, y)`` m, rotated by ``yaw`` rad; at 0 its -x axis points to the robot."""
     return make_pose(Rotation.from_euler("z", yaw).as_matrix(), (x, y, 0.0))
 
 
 def pitched(pitch: float, yaw: float) -> FloatArray:
     """Rotation ``(3, 3)`` of a tool whose approach is raised by ``pitch`` rad from straight down towards ``yaw`` rad.
 
-    At ``pitch`` pi/2 it points level in the direction ``yaw``; the fingers open at right angles to it, level.
+    At ``pitch`` pi/2 it points horizontally in the direction ``yaw``; the fingers open horizontally.
     """
     down = downward(0.0, 0.0, 0.0)[:3, :3]
     return Rotation.from_euler("z", yaw).as_matrix() @ Rotation.from_euler("y", -pitch).as_matrix() @ down

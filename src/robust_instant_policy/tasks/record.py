@@ -1,4 +1,4 @@
-"""Recording demonstrations: the demonstrator tries scene after scene, and only its successes are kept."""
+"""Recording demonstrations: the demonstrator tries one scene after another; only successes are stored."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import RipError
 from robust_instant_policy.tasks.task import Image, Task
 
-MAX_FAILURES_IN_A_ROW = 50  # then the demonstrator cannot do the task at all
+MAX_FAILURES_IN_A_ROW = 50  # after as many failures in a row, recording stops
 
 Progress = Callable[[int, int, int], None]
 
 
 class DemonstrationWriter(Protocol):
-    """Where demonstrations go; `datasets.DatasetWriter` is one.
+    """Destination of demonstrations; `datasets.DatasetWriter` is one.
 
-    ``last_seed`` is the last seed tried, kept or thrown away, ``discarded`` the number thrown away so far.
+    ``last_seed`` is the last seed tried; ``discarded`` is the number of discarded attempts.
     """
 
     @property
@@ -46,9 +46,9 @@ def record(
     """Record until ``writer`` holds ``num_episodes``, trying the scenes ``seed``, ``seed + 1``, … in turn.
 
     ``with_images`` and ``every`` as in `Task.demonstrate`; the writer's rate is that of the steps that are kept.
-    Goes on behind the last seed that the writer knows, so a recording that was cut off ends up with the same
-    episodes as one that was not. After every attempt ``on_progress`` receives (episodes there, episodes wanted,
-    attempts thrown away). Returns how many attempts were thrown away.
+    Continues after the last seed of the writer, so an interrupted recording gets the same episodes as an
+    uninterrupted one. After every attempt ``on_progress`` receives (stored episodes, requested episodes,
+    discarded attempts). Returns the number of discarded attempts.
     """
     if writer.last_seed is not None:
         seed = max(seed, writer.last_seed + 1)
@@ -63,7 +63,7 @@ def record(
             in_a_row += 1
             if in_a_row == MAX_FAILURES_IN_A_ROW:
                 raise RipError(
-                    f"the demonstrator of {task.name} failed {in_a_row} times in a row, the last time because "
+                    f"the demonstrator of {task.name} failed {in_a_row} times in a row, last because "
                     f"{attempt.failure}; this task cannot be recorded"
                 )
         seed += 1

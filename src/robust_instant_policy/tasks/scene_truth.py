@@ -1,4 +1,4 @@
-"""The simulator's own knowledge of a photograph, to measure perception against; no policy may see it."""
+"""The simulator's ground truth for an image, to measure perception; not for policies."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from robust_instant_policy.geometry import FloatArray, invert_pose, transform_po
 
 @dataclass(frozen=True, eq=False)
 class SceneTruth:
-    """``parts (H, W)`` int: index into ``names`` and ``poses (P, 4, 4)`` of the rigid part seen, -1 for none."""
+    """``parts (H, W)`` int: index into ``names`` and ``poses (P, 4, 4)`` of the visible rigid part, -1 for none."""
 
     parts: NDArray[np.int64]
     names: tuple[str, ...]
     poses: FloatArray
 
     def material_point(self, point: ArrayLike, part: str) -> FloatArray:
-        """World ``point (3,)`` in the frame of ``part``: the same in every scene for the same spot of its surface."""
+        """World ``point (3,)`` in the frame of ``part``: constant over scenes for a material point."""
         return transform_points(invert_pose(self.poses[self.names.index(part)]), point)
 
     def world_point(self, material_point: ArrayLike, part: str) -> FloatArray:
-        """Where the spot ``material_point (3,)`` of ``part`` is in this scene."""
+        """World position of ``material_point (3,)`` of ``part`` in this scene."""
         return transform_points(self.poses[self.names.index(part)], material_point)

@@ -20,8 +20,8 @@ from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image, bounded_seed
 from robust_instant_policy.trajectory import Trajectory
 
-HAND_STREAM = 1  # the demonstrator's random numbers, apart from the scene's
-SEED_BITS = 32  # that the simulators take
+HAND_STREAM = 1  # stream of the demonstrator's random numbers, separate from the scene's
+SEED_BITS = 32  # accepted by the simulators
 SETTLE_SECONDS = 0.5  # at rest before a demonstration is judged
 
 Expert = Callable[[Any, np.random.Generator], Sequence[Stroke]]
@@ -29,10 +29,10 @@ Expert = Callable[[Any, np.random.Generator], Sequence[Stroke]]
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """What makes a task: its environment, and the expert that demonstrates it.
+    """Definition of a task: its environment, and the expert that demonstrates it.
 
-    ``expert(env, rng)`` sees the simulator's state, as a person sees the scene. ``object_sets`` and ``asset_sources``
-    are the choices that there are.
+    ``expert(env, rng)`` has access to the simulator's state. ``object_sets`` and ``asset_sources`` are the available
+    choices.
     """
 
     name: str
@@ -47,9 +47,9 @@ class TaskSpec:
 class Cell(Protocol):
     """A gymnasium environment that holds a scene with A arms; see the methods of the same names in `Task`.
 
-    ``advance`` takes one control step towards ``command (A·(J + 1),)``: of one arm after the other the joint angles
-    and the finger travel, rad and m. ``tool_poses`` is where the arms' tool frames are, ``(A, 4, 4)``. ``failure`` says
-    why the task is not done, in words, and nothing once it is.
+    ``advance`` takes one control step towards ``command (A·(J + 1),)``: for each arm the joint angles and the finger
+    travel, rad and m. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is
+    not done, empty if it is done.
     """
 
     def reset(self, *, seed: int) -> Any: ...
@@ -64,9 +64,9 @@ class Cell(Protocol):
 
 @dataclass(frozen=True)
 class Timing:
-    """Control steps a second, of which every ``record_every``-th is recorded and every ``frame_every``-th filmed.
+    """Control rate in Hz; every ``record_every``-th step is recorded, every ``frame_every``-th is a video frame.
 
-    ``execute_hz`` is the rate of the waypoints played back.
+    ``execute_hz`` is the rate of executed waypoints.
     """
 
     control_hz: float
@@ -76,9 +76,9 @@ class Timing:
 
 
 class SimulatedTask:
-    """See `tasks.task.Task`. One scene at a time, built anew from its seed before every execution.
+    """See `tasks.task.Task`. Each execution has a new scene, built from its seed.
 
-    ``arms`` are those that work, all with the same gripper, in the order in which ``cell`` takes their commands.
+    ``arms`` are the working arms, with equal grippers, in the order of the commands of ``cell``.
     """
 
     def __init__(self, spec: TaskSpec, cell: Cell, arms: Sequence[Arm], timing: Timing, workspace: FloatArray):
@@ -91,7 +91,7 @@ class SimulatedTask:
         self._spec, self._cell, self._arms, self._timing = spec, cell, arms, timing
         self._triangle = arms[0].triangle
         self._seed: int | None = None
-        self._fresh = False  # nothing has moved since the scene was built
+        self._fresh = False  # no motion since the scene was built
 
     def reset(self, seed: int) -> Observation:
         self._rebuild(seed)
@@ -99,7 +99,7 @@ class SimulatedTask:
 
     def execute(self, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
         if self._seed is None:
-            raise RipError("there is no scene to execute in; call reset(seed) first")
+            raise RipError("no scene to execute in; call reset(seed) first")
         if not self._fresh:
             self._rebuild(self._seed)
         control_hz = self._timing.control_hz
@@ -110,7 +110,7 @@ class SimulatedTask:
 
     def follow(self, controller: Controller, max_seconds: float, on_frame: FrameSink | None = None) -> Execution:
         if self._seed is None:
-            raise RipError("there is no scene to act in; call reset(seed) first")
+            raise RipError("no scene to act in; call reset(seed) first")
         if not self._fresh:
             self._rebuild(self._seed)
         control_hz = self._timing.control_hz
@@ -154,7 +154,7 @@ class SimulatedTask:
         return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
 
     def scene_truth(self) -> SceneTruth:
-        """What the camera's pixels show: for measuring perception, never for a policy."""
+        """Ground truth of the camera's pixels, to measure perception; not for policies."""
         return self._cell.scene_truth()
 
     def close(self) -> None:
@@ -165,25 +165,26 @@ class SimulatedTask:
         self._seed, self._fresh = seed, True
 
     def _recorded(self, poses: FloatArray, every: int) -> range:
-        """The control steps that are recorded, counted from the last: it is the one that was judged."""
+        """Indices of the recorded control steps; they include the last one, at which success is judged."""
         interval = every * self._timing.record_every
         return range((len(poses) - 1) % interval, len(poses), interval)
 
     def _play(self, motion: Motion, before_step: Callable[[], None]) -> float:
-        """Run the commands; the largest distance between a palm commanded and reached, in metres."""
-        palm = np.array([0.0, 0.0, -self._triangle.length])
+        """Run the commands; returns the largest distance between commanded and reached gripper point, metres."""
+        gripper_point = np.array([0.0, 0.0, -self._triangle.length])
         self._fresh = False
         worst = 0.0
         for command, poses in zip(motion.commands, motion.poses, strict=True):
             before_step()
             self._cell.advance(command)
             reached = self._cell.tool_poses()
-            missed = (poses[:, :3, :3] @ palm + poses[:, :3, 3]) - (reached[:, :3, :3] @ palm + reached[:, :3, 3])
+            commanded = poses[:, :3, :3] @ gripper_point + poses[:, :3, 3]
+            missed = commanded - (reached[:, :3, :3] @ gripper_point + reached[:, :3, 3])
             worst = max(worst, float(np.linalg.norm(missed, axis=1).max()))
         return worst
 
     def _filming(self, on_frame: FrameSink | None) -> Callable[[], None]:
-        """To be called before every control step: hands out the frames of a video."""
+        """Returns a function to call before each control step; it passes video frames to ``on_frame``."""
         if on_frame is None:
             return _nothing
         step = count()
@@ -195,7 +196,7 @@ class SimulatedTask:
         return before_step
 
     def _photographing(self, images: list[Image], steps: range) -> Callable[[], None]:
-        """To be called before every control step: adds to ``images`` what the camera sees before those of ``steps``."""
+        """Returns a function to call before each control step; it appends the image to ``images`` at ``steps``."""
         step = count()
 
         def before_step() -> None:
@@ -204,9 +205,9 @@ class SimulatedTask:
 
         return before_step
 
-    def _action(self, shut: np.ndarray) -> FloatArray:
-        """Where the grippers are, with the states ``shut (A,)`` they were told to take, as an action ``(10·A,)``."""
-        return Trajectory.from_poses(self._cell.tool_poses()[None], shut[None], self._triangle).actions[0]
+    def _action(self, closed: np.ndarray) -> FloatArray:
+        """Current gripper poses with the commanded states ``closed (A,)``, as an action ``(10·A,)``."""
+        return Trajectory.from_poses(self._cell.tool_poses()[None], closed[None], self._triangle).actions[0]
 
     def _rest(self, motion: Motion) -> None:
         for _ in range(int(SETTLE_SECONDS * self._timing.control_hz)):
@@ -214,4 +215,4 @@ class SimulatedTask:
 
 
 def _nothing() -> None:
-    """What happens before a control step that nobody looks at."""
+    """Called before each control step when nothing is recorded."""

@@ -1,4 +1,4 @@
-"""The contract between tasks and everything above them. Tasks know no method; methods know no task."""
+"""The protocol of a task. Tasks are independent of methods, methods of tasks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FrameSink = Callable[[Image], None]
 
 
 def bounded_seed(seed: int, bits: int) -> int:
-    """``seed`` where it fits into ``bits`` bits, else a number of up to 64 of them that is drawn with it."""
+    """``seed`` if it fits into ``bits`` bits, else a number of ``bits`` bits, up to 64, derived from it."""
     if seed < 1 << bits:
         return seed
     return int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]) >> (64 - bits)
@@ -28,10 +28,10 @@ def bounded_seed(seed: int, bits: int) -> int:
 
 @dataclass(frozen=True)
 class Execution:
-    """What happened when a trajectory was executed.
+    """Result of executing a trajectory.
 
-    ``failure`` says in words why it failed and is empty on success; ``seconds`` is simulated (or real) time;
-    ``tracking_error`` the largest distance in metres between the commanded and the reached palm point.
+    ``failure`` is the reason of a failure, empty on success; ``seconds`` is simulated (or real) time;
+    ``tracking_error`` is the largest distance in metres between the commanded and the reached gripper point.
     """
 
     success: bool
@@ -42,7 +42,7 @@ class Execution:
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """One try of a demonstrator; ``images (T, H, W, 3)`` uint8, one for each of its steps, where asked for."""
+    """One attempt of a demonstrator; ``images (T, H, W, 3)`` uint8, one per step, if requested."""
 
     demonstration: Demonstration
     success: bool
@@ -51,13 +51,12 @@ class Attempt:
 
 
 class Task(Protocol):
-    """A scene, a robot in it, and a person who can show what to do.
+    """A scene, a robot, and a demonstrator.
 
-    ``description`` says what is to be done, in one sentence, and ``goal`` what is true once it is done
-    ("the cube is in the goal"). ``end_effectors`` names the grippers that a trajectory of this task is for, in the
-    order of its columns. ``workspace (2, 3)`` are the lower and upper corner, in metres, of the volume in
-    which the arm works; keypoints outside it mean nothing. ``record_hz`` and ``execute_hz`` are the rates of
-    demonstrations and of the waypoints played back, ``video_hz`` that of the frames `execute` hands out.
+    ``description`` is the task in one sentence, ``goal`` the condition of success ("the cube is in the goal").
+    ``end_effectors`` names the grippers in the order of the columns of a trajectory. ``workspace (2, 3)`` are the lower
+    and upper corner, in metres, of the volume in which the arm works; keypoints outside it are ignored. ``record_hz``
+    and ``execute_hz`` are the rates of demonstrations and of executed waypoints, ``video_hz`` that of video frames.
     """
 
     name: str
@@ -70,33 +69,33 @@ class Task(Protocol):
     workspace: FloatArray
 
     def reset(self, seed: int) -> Observation:
-        """Draw the scene of ``seed`` and photograph it; the same seed gives the same scene and image."""
+        """Draw the scene of ``seed`` and take its image; the same seed gives the same scene and image."""
         ...
 
     def execute(self, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
-        """Run ``trajectory`` in the scene of the last `reset`; ``on_frame`` receives video frames.
+        """Execute ``trajectory`` in the scene of the last `reset`; ``on_frame`` receives video frames.
 
-        Raises `UnreachableError`, before anything moves, for a trajectory the arm cannot follow safely.
+        Raises `UnreachableError`, before the arm moves, for a trajectory that fails a check of `motion`.
         """
         ...
 
     def follow(self, controller: Controller, max_seconds: float, on_frame: FrameSink | None = None) -> Execution:
-        """Let ``controller`` move the robot, from home, in the scene of the last `reset`, for ``max_seconds`` at most.
+        """Run ``controller`` from the home pose in the scene of the last `reset`, for ``max_seconds`` at most.
 
-        A waypoint that the arm cannot follow safely ends the episode where it is, and is its ``failure``.
+        A waypoint that fails a check of `motion` ends the episode; the reason is its ``failure``.
         """
         ...
 
     def demonstrate(self, seed: int, with_images: bool = False, every: int = 1) -> Attempt:
-        """Let the demonstrator try the scene of ``seed``, in its own manner for that seed.
+        """Let the demonstrator try the scene of ``seed``; its variation depends on the seed, too.
 
-        What is kept is every ``every``-th step of what was recorded, the last one included, with its image where
-        images are asked for: rendering them is what takes the time.
+        Keeps every ``every``-th recorded step, including the last one, ``with_images`` with an image for each;
+        rendering images takes most of the time.
         """
         ...
 
     def scene_truth(self) -> SceneTruth:
-        """What the pixels of the last `reset` show: for measuring perception, never for a policy."""
+        """Ground truth of the image of the last `reset`, to measure perception; not for policies."""
         ...
 
     def close(self) -> None: ...

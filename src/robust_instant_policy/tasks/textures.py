@@ -1,4 +1,4 @@
-"""How materials look, as sRGB images."""
+"""Textures of materials, as sRGB images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LAMINATE_CONTRAST = 0.02
 
 
 def wood(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Fibres along the image's rows, as they run in a sawn board."""
+    """Wood with fibres along the rows of the image."""
     down = np.linspace(0.0, 1.0, GRAIN_PIXELS)[:, None]
     along = np.linspace(0.0, 1.0, GRAIN_PIXELS)[None]
     bend = 0.04 * np.sin(2 * np.pi * (along * rng.uniform(0.5, 1.5) + rng.random()))
@@ -31,13 +31,13 @@ def wood(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
 
 
 def laminate(rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The light grey, slightly speckled top of a laboratory table."""
+    """A light grey, slightly speckled table top."""
     speckle = rng.normal(0.0, 1.0, (LAMINATE_PIXELS, LAMINATE_PIXELS, 1))
     return (np.clip(np.array(LAMINATE) * (1 + LAMINATE_CONTRAST * speckle), 0.0, 1.0) * 255).astype(np.uint8)
 
 
 def bristles(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Tufts along the image's columns."""
+    """Bristles along the columns of the image."""
     shade = 1 + BRISTLE_CONTRAST * rng.normal(0.0, 1.0, (1, GRAIN_PIXELS, 1))
     return np.broadcast_to(
         (np.clip(np.array(color) * shade, 0.0, 1.0) * 255).astype(np.uint8), (GRAIN_PIXELS, GRAIN_PIXELS, 3)

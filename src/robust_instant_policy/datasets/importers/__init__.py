@@ -1,7 +1,6 @@
-"""Demonstrations that others have: ManiSkill trajectory files, robomimic HDF5, LeRobot datasets.
+"""Importing recordings: ManiSkill trajectory files, robomimic HDF5 files, LeRobot datasets.
 
-What such a file lacks for a demonstration is said, all of it at once, and never made up; what the user knows
-besides can be given.
+If a file lacks data of a demonstration, an error lists all of it; nothing is assumed. The user can supply missing data.
 """
 
 from robust_instant_policy.datasets.importers.convert import convert_demonstrations, import_demonstrations

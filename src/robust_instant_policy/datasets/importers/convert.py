@@ -1,4 +1,4 @@
-"""From another's file to demonstrations, or to a demonstrations folder."""
+"""Converting a recording to demonstrations, or to a demonstrations folder."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from robust_instant_policy.datasets.writer import DatasetWriter
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
 
-SAME_M = 1e-5  # poses are kept as float32
+SAME_M = 1e-5  # poses are stored as float32
 
 
 def import_demonstrations(path: str | Path, task: str, rig: Rig) -> list[Demonstration]:
     """The successful demonstrations of ``task`` in a ManiSkill, robomimic or LeRobot v3 recording.
 
-    Raises `DatasetError` for another kind of file, and for one that lacks what a demonstration needs; the
-    error lists all of it, and how to supply what can be known.
+    Raises `DatasetError` for another kind of file, and for one that lacks data of a demonstration; the error
+    lists all of it, and how to supply it.
     """
     return [episode.demonstration(task, rig.triangle) for episode in _read_episodes(Path(path), rig)]
 
 
 def convert_demonstrations(path: str | Path, out: str | Path, task: str, description: str, rig: Rig) -> int:
-    """Write what `import_demonstrations` reads into a demonstrations folder, with the images along the way.
+    """Write what `import_demonstrations` reads into a demonstrations folder, with the images of all steps.
 
-    Goes on where an earlier call was interrupted, and adds to what recordings of other names gave. Returns the number
+    Continues an interrupted call, and adds to episodes of other recordings. Returns the number
     of demonstrations in the folder.
     Raises `DatasetError` as `import_demonstrations` and `DatasetWriter` do.
     """
@@ -54,7 +54,7 @@ def convert_demonstrations(path: str | Path, out: str | Path, task: str, descrip
 
 
 def _is_new(demonstration: Demonstration, there: Iterable[Demonstration], out: Path) -> bool:
-    """Whether no episode of its name is among those ``there``; `DatasetError` where one is that differs."""
+    """Whether ``there`` has no episode of its name; `DatasetError` if it has a different one of that name."""
     for other in there:
         if all(demonstration.info.get(name) == other.info.get(name) for name in ("source", "episode")):
             actions = demonstration.trajectory.actions, other.trajectory.actions

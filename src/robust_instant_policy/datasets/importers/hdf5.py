@@ -1,4 +1,4 @@
-"""HDF5 files of others, opened with errors in one line, and read without leaving the file."""
+"""Reading HDF5 files from other people: errors in one line, and no access to other files."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ MAX_ARRAY_BYTES = 2**32  # of one array; the images of an episode are the larges
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Any]:
-    """The open ``h5py.File``. Raises `DatasetError` for one that is missing or damaged, also while it is read, and for
-    one with links: an external link leads to another file.
+    """The open ``h5py.File``. Raises `DatasetError` for a missing or damaged file, also while it is read, and for
+    one with links, because an external link refers to another file.
     """
     try:
         import h5py
@@ -31,13 +31,11 @@ def open_hdf5(path: Path) -> Iterator[Any]:
         with h5py.File(path, "r") as file:
             link = file.visititems_links(lambda name, link: None if isinstance(link, h5py.HardLink) else name)
             if link is not None:
-                raise DatasetError(
-                    f"{path}: {excerpt(link)!r} is a link in place of content; copy the file with its links resolved"
-                )
+                raise DatasetError(f"{path}: {excerpt(link)!r} is a link; copy the file with its links resolved")
             yield file
     except FileNotFoundError:
         raise DatasetError(f"there is no file {path}") from None
-    except (OSError, RuntimeError, KeyError) as error:  # of h5py, for damage in any place of the file
+    except (OSError, RuntimeError, KeyError) as error:  # errors of h5py for damaged files
         raise DatasetError(f"{path} is damaged or not an HDF5 file: {excerpt(error)}") from error
 
 
@@ -49,10 +47,10 @@ def has(group: Any, name: str) -> bool:
 
 
 def read(group: Any, name: str, ndim: int) -> NDArray | None:
-    """The array ``name`` of numbers of a group, or None where there is none.
+    """The array ``name`` of numbers of a group, or None if it is missing.
 
-    Raises `DatasetError` for one of other dimensions, without content, of another type, or too large, and for one
-    that is stored in another file.
+    Raises `DatasetError` for an array of other dimensions or type, an empty or too large one, and one that is stored
+    in another file.
     """
     import h5py
 
@@ -72,7 +70,7 @@ def read(group: Any, name: str, ndim: int) -> NDArray | None:
 
 
 def members(group: Any, name: str) -> list[str]:
-    """Names in the group ``name`` of a group; none where there is no such group."""
+    """Names in the group ``name`` of a group; empty if it is missing."""
     import h5py
 
     inner = group[name] if has(group, name) else None
@@ -93,7 +91,7 @@ def read_json_attribute(group: Any, name: str) -> dict[str, Any]:
 
 
 def nested(content: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    """The JSON object that ``names`` lead to, one in the other; empty where there is none."""
+    """The nested JSON object at the path ``names``; empty if it is missing."""
     inner: Any = content
     for name in names:
         inner = inner.get(name) if isinstance(inner, Mapping) else None
@@ -101,12 +99,12 @@ def nested(content: Mapping[str, Any], *names: str) -> dict[str, Any]:
 
 
 def first_matrix(array: NDArray | None) -> NDArray[np.float64] | None:
-    """The first of some matrices ``(T, …)``, as float64."""
+    """The first of the matrices ``(T, …)``, as float64."""
     return None if array is None else array[0].astype(np.float64)
 
 
 def choose_camera(path: Path, cameras: Sequence[str], wanted: str | None) -> str | None:
-    """The camera ``wanted``, or the only one. Raises `DatasetError` naming those that are there."""
+    """The camera ``wanted``, or the only one. Raises `DatasetError` with the available ones."""
     if wanted is None and len(cameras) <= 1:
         return cameras[0] if cameras else None
     if wanted not in cameras:

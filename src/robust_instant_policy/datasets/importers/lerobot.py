@@ -1,8 +1,8 @@
 """LeRobot v3 datasets whose frames carry end-effector poses.
 
-The format has no place for the camera's intrinsics and pose, for the unit of depth or for what gripper values mean,
-so these come from the user. A pose is three axes x, y, z and either wx, wy, wz (a rotation vector, as lerobot's own
-kinematics write it: ``ee.x … ee.wz, ee.gripper_pos``) or qx, qy, qz, qw, whatever stands before them.
+The format does not store the camera's intrinsics and pose, the unit of depth or the meaning of gripper values,
+so the user supplies them. A pose is three axes x, y, z and either wx, wy, wz (a rotation vector, as lerobot's own
+kinematics write it: ``ee.x … ee.wz, ee.gripper_pos``) or qx, qy, qz, qw, with any prefix.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ POSITION, ROTATION_VECTOR, QUATERNION = ("x", "y", "z"), ("wx", "wy", "wz"), ("q
 POSE_FEATURES = (
     layout.STATE_KEY,
     layout.ACTION_KEY,
-)  # where poses are looked for, what was reached before what was asked
+)  # features with poses; measured ones first, then commanded ones
 ADVICE = (
     "A LeRobot dataset names the axes of a pose ee.x, ee.y, ee.z and ee.wx, ee.wy, ee.wz (rotation vector) or "
     "ee.qx … ee.qw; depth is a feature with one number a pixel, named by depth_key= with its depth_unit_m="
@@ -44,7 +44,7 @@ def read_lerobot(
     """The episodes of a LeRobot v3 dataset."""
     folder = open_folder(path)
     if (path / layout.RIP_PATH).exists():
-        raise DatasetError(f"{path} already is a demonstrations folder of rip; read it with load_demonstrations")
+        raise DatasetError(f"{path} is already a demonstrations folder of rip; read it with load_demonstrations")
     features = folder.info["features"]
     cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image") and key != depth_key]
     chosen = choose_camera(path, cameras, camera)
@@ -99,7 +99,7 @@ def _poses_and_gripper(folder: Folder, episode: int) -> tuple[FloatArray | None,
 
 
 def _axis_names(feature: Mapping[str, Any]) -> list[str]:
-    """Names of a vector's axes; datasets write a list, or lists by the kind of motor."""
+    """Names of a vector's axes; datasets have a list, or lists by kind of motor."""
     names = feature.get("names") or []
     if isinstance(names, Mapping):
         names = [name for group in names.values() if isinstance(group, list) for name in group]
@@ -107,7 +107,7 @@ def _axis_names(feature: Mapping[str, Any]) -> list[str]:
 
 
 def _pose_axes(names: Sequence[str]) -> list[int] | None:
-    """Columns of x, y, z and the rotation; None where there is no pose, or more than one."""
+    """Columns of x, y, z and the rotation; None if there is no pose or more than one."""
     columns: dict[str, list[int]] = {}
     for column, name in enumerate(names):
         match = AXIS.match(name)

@@ -75,7 +75,7 @@ def _read_episode(
         camera_pose=None if extrinsics is None else invert_pose(np.vstack([extrinsics, [0, 0, 0, 1]])),
         poses=None if tcp is None else poses_of(f"{path} ({name})", tcp, [4, 5, 6, 3]),
         tool=np.eye(4) if panda else None,
-        # The command given at an observation; none is given at the last one, so the one before holds.
+        # The command at each observation; the last observation has none, so the previous command is repeated.
         gripper_values=None if actions is None else np.append(actions[:, -1], actions[-1, -1]).astype(np.float64),
         gripper=PANDA_GRIPPER if panda else None,
         rate_hz=nested(kwargs, "sim_config").get("control_freq"),
@@ -86,7 +86,7 @@ def _read_episode(
 
 
 def _robots(group: Any, kwargs: Mapping[str, Any]) -> set[str]:
-    """Names of the robot: what the environment was made with, or the articulations that moved in it."""
+    """Names of the robot: from the environment's arguments, or the moving articulations."""
     if "robot_uids" in kwargs:
         return {str(kwargs["robot_uids"])}
     return set(members(group, "env_states/articulations"))

@@ -1,4 +1,4 @@
-"""An episode as another format holds it, and how it becomes a demonstration or a list of what it lacks."""
+"""An episode of another format, and its conversion to a demonstration or to a list of missing data."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.trajectory import Trajectory
 
-MIN_QUATERNION = 1e-6  # shorter ones have no direction
+MIN_QUATERNION = 1e-6  # shorter quaternions have no direction
 
 
 @dataclass(frozen=True)
 class GripperCommand:
-    """What a recorded gripper value means: ``open`` and ``closed`` are the values of either."""
+    """Meaning of recorded gripper values: those of ``open`` and ``closed``."""
 
     open: float
     closed: float
@@ -38,7 +38,7 @@ def poses_of(name: str, numbers: NDArray, rotation: Sequence[int]) -> FloatArray
     """Poses ``(T, 4, 4)`` of ``numbers (T, D)``: three coordinates, and the rotation in the columns ``rotation``, three
     of a rotation vector or four of a quaternion x, y, z, w.
 
-    Raises `DatasetError` that begins with ``name`` where they are no poses.
+    Raises `DatasetError` that begins with ``name`` if they are not poses.
     """
     if numbers.ndim != 2 or numbers.shape[1] < 3 + len(rotation) or not np.isfinite(numbers).all():
         raise DatasetError(f"{name}: poses must be finite, (T, {3 + len(rotation)}), got {numbers.shape}")
@@ -53,14 +53,13 @@ def poses_of(name: str, numbers: NDArray, rotation: Sequence[int]) -> FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """The robot and the camera that a file was recorded with, as far as the user knows and the file does not say.
+    """What the user knows about the robot and the camera of a recording, for data that the file does not contain.
 
-    ``triangle`` stands for the gripper in the imported trajectories, so it is the choice of whoever plays them
-    back. ``camera`` names the camera whose image and depth show the start. ``intrinsics (3, 3)``,
-    ``camera_pose (4, 4)`` camera to world, OpenCV axes; ``tool (4, 4)`` the tool frame of `geometry` within the
-    recorded end-effector frame; ``gripper`` what the last action, or the gripper's position, means; ``rate_hz`` the
-    rate of the frames. For LeRobot datasets, ``depth_key`` is the feature with the depth and ``depth_unit_m`` the
-    metres of one of its steps.
+    ``triangle`` is the gripper of the imported trajectories, that of the executing robot. ``camera`` names the camera
+    of the start image. ``intrinsics (3, 3)``, ``camera_pose (4, 4)`` camera to world, OpenCV axes; ``tool (4, 4)`` the
+    tool frame of `geometry` within the recorded end-effector frame; ``gripper`` the meaning of the last action or of
+    the gripper's position; ``rate_hz`` the rate of the frames. For LeRobot datasets, ``depth_key`` is the feature with
+    the depth and ``depth_unit_m`` the metres per step.
     """
 
     triangle: GripperTriangle
@@ -76,12 +75,12 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class SourceEpisode:
-    """What a file says about one episode; None for what it does not say.
+    """The data of a file about one episode; None for missing data.
 
     ``rgb``, ``depth`` (metres), ``intrinsics``, ``camera_pose`` as in `Observation`; ``poses (T, 4, 4)`` of the
     end effector in the world; ``tool (4, 4)``, the tool frame of `geometry` within the end effector's own;
-    ``gripper_values (T,)`` and what they mean. ``images`` gives ``(T, H, W, 3)`` uint8 along the way.
-    ``advice`` says how such a file comes to hold what it lacks.
+    ``gripper_values (T,)`` and their meaning. ``images`` returns ``(T, H, W, 3)`` uint8 of all steps.
+    ``advice`` says how to obtain a file with the missing data.
     """
 
     name: str
@@ -99,13 +98,13 @@ class SourceEpisode:
     advice: str = ""
 
     def on(self, rig: Rig) -> SourceEpisode:
-        """The episode with what is known of its rig; that outweighs what the file says."""
+        """The episode with the data of ``rig``, which override those of the file."""
         names = ("intrinsics", "camera_pose", "tool", "gripper", "rate_hz")
         known = {name: getattr(rig, name) for name in names if getattr(rig, name) is not None}
         return replace(self, **known)
 
     def demonstration(self, task: str, triangle: GripperTriangle) -> Demonstration:
-        """Raises `DatasetError` that lists everything a demonstration needs and this episode lacks."""
+        """Raises `DatasetError` that lists all missing data of a demonstration."""
         if (
             self.poses is None
             or self.gripper_values is None

@@ -1,6 +1,6 @@
 """KAT-DP: the keypoints of KAT in, its trajectory out, with a diffusion model in place of the language model.
 
-The method of the paper's comparison (Di Palo and Johns 2024; Oh et al. 2025, Sec. V-B).
+The method of the paper's comparison (Di Palo and Johns 2024; Oh et al. 2025, Sec. V-A.2).
 """
 
 from __future__ import annotations

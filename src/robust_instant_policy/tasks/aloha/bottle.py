@@ -22,7 +22,7 @@ UNSEEN_COLORS: tuple[Color, ...] = ((0.92, 0.92, 0.88), (0.55, 0.30, 0.60), (0.3
 
 @dataclass(frozen=True)
 class Bottle:
-    """Stands on z = 0 about the z axis; ``radius`` and ``height`` of the body under the shoulder, in metres.
+    """A bottle on z = 0 around the z axis; ``radius`` and ``height`` of the body under the shoulder, in metres.
 
     ``facets`` 0 is a round bottle.
     """

@@ -1,4 +1,4 @@
-"""The red bowl: open at the top, its wall made of boxes for whatever falls in."""
+"""The red bowl; its collision shape is a ring of boxes, so that objects can lie in it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ INSIDE = (0.84, 0.16, 0.13)
 
 @dataclass(frozen=True)
 class Bowl:
-    """Stands on z = 0 about the z axis; ``radius`` of the rim and ``height``, in metres."""
+    """A bowl on z = 0 around the z axis; ``radius`` of the rim and ``height``, in metres."""
 
     radius: float
     height: float

@@ -1,4 +1,4 @@
-"""What one sweeps with: a hand brush with an upright handle, and a dustpan."""
+"""Tools for sweeping: a brush with an upright handle, and a dustpan."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PAN_BLUE: Color = (0.12, 0.32, 0.62)
 
 @dataclass(frozen=True)
 class Brush:
-    """Stands on its bristles on z = 0, its width along y; lengths in metres."""
+    """A brush on its bristles on z = 0, its width along y; lengths in metres."""
 
     seed: int
     width: float = 0.085
@@ -43,7 +43,7 @@ class Brush:
     BACK_M: ClassVar[float] = 0.012
     TIPS_M: ClassVar[float] = 0.008
     HANDLE_M: ClassVar[tuple[float, float]] = (0.020, 0.024)
-    # Bristles bend: they press with a few newtons when they are some millimetres too low.
+    # Soft bristles: a few newtons of force at some millimetres of penetration.
     SOFT: ClassVar[dict] = dict(priority=1, solref=[0.045, 1.0], solimp=[0.2, 0.9, 0.008, 0.5, 2.0])
 
     @property
@@ -68,7 +68,7 @@ class Brush:
             add_surface(spec, body, f"{name}-{part}", moved(box_surface(size), place), image, shine=0.1)
             touch = dict(friction=BRISTLE_FRICTION, **self.SOFT) if part == "bristles" else dict(friction=WOOD_FRICTION)
             add_solid(body, BOX, np.array(size) / 2, position=place, mass=mass * self.MASS_KG, **touch)
-        # Above their tips the bristles stand firm: what they are pushed against does not get under them.
+        # Above their tips the bristles are rigid, so that objects do not get under them.
         firm = self.bristle_length - self.TIPS_M
         size, place = (self.depth, self.width, firm), (0.0, 0.0, self.TIPS_M + firm / 2)
         add_solid(body, BOX, np.array(size) / 2, position=place, friction=BRISTLE_FRICTION)
@@ -77,7 +77,7 @@ class Brush:
 
 @dataclass(frozen=True)
 class Dustpan:
-    """Lies on z = 0, its lip along y at x = 0, the pan and its handle behind it along x; lengths in metres."""
+    """A dustpan on z = 0, its lip along y at x = 0, the pan and its handle behind it along x; lengths in metres."""
 
     width: float = 0.19
     depth: float = 0.11
@@ -93,7 +93,7 @@ class Dustpan:
 
     @property
     def grip(self) -> FloatArray:
-        """Where one holds it, the handle's middle ``(3,)``."""
+        """Grasp point: the middle of the handle ``(3,)``."""
         return np.array([self.depth + self.handle_length / 2, 0.0, self.HANDLE_HEIGHT_M])
 
     def build(self, spec: mujoco.MjSpec, name: str, pose: FloatArray) -> Body:

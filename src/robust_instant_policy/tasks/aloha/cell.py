@@ -34,9 +34,9 @@ from robust_instant_policy.tasks.textures import laminate
 
 CONTROL_HZ = 50.0  # ALOHA's own
 TIMESTEP_S = 0.002
-SETTLE_SECONDS = 0.4  # in which objects come to rest before anybody looks
+SETTLE_SECONDS = 0.4  # for objects to come to rest before the image
 
-# Intel RealSense D415 at 640x480: the sides of its 65 x 40 degrees are cut off, the height stays.
+# Intel RealSense D415 at 640x480: the sides of the 65 x 40 degrees are cropped, the height is kept.
 CAMERA_HEIGHT_M = 0.85
 CAMERA_X_M = -0.05
 CAMERA_WIDTH, CAMERA_HEIGHT = 640, 480
@@ -56,12 +56,12 @@ WORKSPACE = np.array([[-0.30, -0.32, -0.005], [0.22, 0.32, 0.4]])
 
 
 class AlohaEnv(gymnasium.Env):
-    """Base of the five environments; a subclass adds its objects and says when they are where they should be.
+    """Base of the five environments; a subclass adds its objects and its condition of success.
 
-    ``end_effectors`` are the arms that work; others stay parked. ``beside`` is where the camera for videos stands and
-    what it looks at. Actions are, of one arm after the other, the six joint angles (rad) and the travel of each finger
-    (m, 0 closed), at `CONTROL_HZ`. Observations are the same numbers as reached, ``joints``, and with
-    ``obs_mode="rgbd"`` the camera's ``rgb`` and ``depth`` (metres). The reward is 1 where the task is done.
+    ``end_effectors`` are the working arms; the others are parked. ``beside`` is position and target of the camera for
+    videos. Actions are, for each arm, the six joint angles (rad) and the travel of each finger
+    (m, 0 closed), at `CONTROL_HZ`. Observations are the same quantities as measured, ``joints``, and with
+    ``obs_mode="rgbd"`` the camera's ``rgb`` and ``depth`` (metres). The reward is 1 if the task is done.
     ``objects`` as in `tasks.make_task`.
     """
 
@@ -92,11 +92,11 @@ class AlohaEnv(gymnasium.Env):
         raise NotImplementedError
 
     def failure(self) -> str:
-        """Why the task is not done, in words; nothing once it is."""
+        """Reason why the task is not done; empty if it is done."""
         raise NotImplementedError
 
     def draw(self, what: str) -> np.random.Generator:
-        """The episode's random numbers for ``what`` ("shape", "pose"), the same for the same seed."""
+        """Random generator of the episode for ``what`` ("shape", "pose"), determined by the seed."""
         return np.random.default_rng([self._seed, *what.encode()])
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
@@ -129,7 +129,7 @@ class AlohaEnv(gymnasium.Env):
         return self._observation(), float(not failure), False, False, {"success": not failure, "failure": failure}
 
     def advance(self, command: FloatArray) -> None:
-        """One control step, with joint angles and finger travel ``(7·A,)`` commanded, judging nothing."""
+        """One control step, with joint angles and finger travel ``(7·A,)`` commanded, without evaluation."""
         self._joints_before = self._joints()
         for side, (*angles, travel) in zip(self.end_effectors, command.reshape(-1, len(ARM_JOINTS) + 1), strict=True):
             for joint, angle in zip(ARM_JOINTS, angles, strict=True):
@@ -138,7 +138,7 @@ class AlohaEnv(gymnasium.Env):
         mujoco.mj_step(self.model, self.data, round(1 / CONTROL_HZ / TIMESTEP_S))
 
     def photograph(self) -> Observation:
-        """What the camera above the table sees now."""
+        """The current image of the camera above the table."""
         renderer = self._renderer(CAMERA_WIDTH, CAMERA_HEIGHT)
         renderer.update_scene(self.data, "top")
         rgb = renderer.render()
@@ -156,7 +156,7 @@ class AlohaEnv(gymnasium.Env):
         )
 
     def scene_truth(self) -> SceneTruth:
-        """What each pixel of the top view shows, and where it is."""
+        """Ground truth of each pixel of the top view."""
         renderer = self._renderer(CAMERA_WIDTH, CAMERA_HEIGHT)
         renderer.update_scene(self.data, "top")
         renderer.enable_segmentation_rendering()
@@ -182,11 +182,11 @@ class AlohaEnv(gymnasium.Env):
         self._close_renderers()
 
     def tool_poses(self) -> FloatArray:
-        """Where the working arms' tool frames are, ``(A, 4, 4)``."""
+        """Poses of the working arms' tool frames, ``(A, 4, 4)``."""
         return np.stack([site_pose(self.data, f"{ARMS[side]}/{TOOL}") for side in self.end_effectors])
 
     def pose_of(self, body: str) -> FloatArray:
-        """Where a body is, ``(4, 4)``."""
+        """Pose of a body, ``(4, 4)``."""
         place = self.data.body(body)
         return make_pose(place.xmat.reshape(3, 3), place.xpos)
 
@@ -196,7 +196,7 @@ class AlohaEnv(gymnasium.Env):
         return bool(moved.max() * CONTROL_HZ <= STILL_RAD_S)
 
     def is_still(self, body: str) -> bool:
-        """Whether a body moves no faster than `STILL_M_S`."""
+        """Whether a body is not faster than `STILL_M_S`."""
         return bool(np.linalg.norm(self.data.joint(body).qvel[:3]) <= STILL_M_S)
 
     def touch(self, body: str, other: str) -> float:
@@ -214,7 +214,7 @@ class AlohaEnv(gymnasium.Env):
         return all(self.touch(body, f"{ARMS[side]}/{finger}_link") > HELD_N for finger in FINGERS)
 
     def _joints(self) -> FloatArray:
-        """Joint angles and finger travel of the working arms, as commands have them ``(7·A,)``."""
+        """Joint angles and finger travel of the working arms, in the order of commands ``(7·A,)``."""
         reached: list[float] = []
         for side in self.end_effectors:
             reached += [self.data.joint(f"{ARMS[side]}/{joint}").qpos[0] for joint in ARM_JOINTS]

@@ -1,4 +1,4 @@
-"""A tumbler with facets, so that it can lie without rolling away."""
+"""A tumbler with facets, so that it does not roll."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ INSIDE: Color = (0.93, 0.91, 0.85)
 
 @dataclass(frozen=True)
 class Cup:
-    """Stands on z = 0 about the z axis; ``foot`` and ``rim`` are radii, in metres."""
+    """A cup on z = 0 around the z axis; ``foot`` and ``rim`` are radii, in metres."""
 
     foot: float
     rim: float
@@ -56,10 +56,10 @@ class Cup:
         return float(np.arctan2((self.rim - self.foot) * np.cos(np.pi / FACETS), self.height))
 
     def lying(self) -> FloatArray:
-        """Pose ``(4, 4)`` on one of its facets, at the origin, the mouth towards x."""
+        """Pose ``(4, 4)`` lying on a facet at the origin, the mouth towards x."""
         lowest = self.foot * np.cos(np.pi / FACETS)
         turn, tilt = np.pi / FACETS, self.taper
-        # The axis points along x, raised by the taper; the body is turned so that a facet looks down.
+        # The axis points along x, raised by the taper; the body is rotated so that a facet is at the bottom.
         axis = np.array([np.cos(tilt), 0.0, np.sin(tilt)])
         side = np.array([0.0, 1.0, 0.0])
         up = np.cross(axis, side)

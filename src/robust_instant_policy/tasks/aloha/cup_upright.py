@@ -1,4 +1,4 @@
-"""Take a lying cup and stand it upright."""
+"""Grasp a lying cup and stand it upright."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from robust_instant_policy.tasks.aloha.cell import AlohaEnv
 from robust_instant_policy.tasks.aloha.cup import Cup
-from robust_instant_policy.tasks.aloha.hands import back, bearing, grip, over
+from robust_instant_policy.tasks.aloha.tool_poses import back, bearing, grip, over
 from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.poses import facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
@@ -17,19 +17,19 @@ YAW_RANGE_RAD = np.deg2rad(30)
 
 UPRIGHT_RAD = np.deg2rad(8)
 
-PITCH_RAD = np.deg2rad(-15)  # of the hand when it comes down: turned by 90 degrees it still clears the table
+PITCH_RAD = np.deg2rad(-15)  # of the descending gripper: rotated by 90 degrees it still clears the table
 HOLD_SHARE = 0.5  # of the cup's height
 BEYOND_M = 0.012  # fingertips past the cup's axis
 APPROACH_M = 0.08
 FORWARD_M = 0.09  # from where the cup's middle lay to where it stands
 LIFT_M = 0.05
-TURN_FIRST_RAD = np.deg2rad(20)  # that the hand is raised by while it is lifted
+TURN_FIRST_RAD = np.deg2rad(20)  # rotation of the gripper during the lift
 OVER_M = 0.02  # of the cup's foot over the table before it is set down
-SET_DOWN_M = 0.003  # of its foot over the table when it is let go
+SET_DOWN_M = 0.003  # of its foot over the table at release
 
 
 class CupUprightEnv(AlohaEnv):
-    """Success: the cup stands on the table on its foot, let go of and at rest."""
+    """Success: the cup stands on the table on its foot, released and at rest."""
 
     cup: Cup
 
@@ -50,7 +50,7 @@ class CupUprightEnv(AlohaEnv):
 
 
 def stand_up(env: CupUprightEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Hold the cup across its middle, turn it mouth up on the way forward, set it down, let go and draw back."""
+    """Grasp the cup across its middle, rotate it upright while moving, set it down, release and retreat."""
     lying = env.pose_of("cup")
     axis = lying[:3, 2]
     yaw, rise = float(np.arctan2(axis[1], axis[0])), float(np.arcsin(axis[2]))

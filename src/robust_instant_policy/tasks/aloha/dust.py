@@ -1,4 +1,4 @@
-"""What gets swept up: a small thing that slides but does not roll."""
+"""The object to sweep: small, slides, does not roll."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STUD_M = (0.0035, 0.004)  # radius and height of a toy brick's studs
 
 @dataclass(frozen=True)
 class Dust:
-    """Lies on z = 0 about the z axis; ``size (3,)`` in metres; ``kind`` is "paper", "brick" or "lid"."""
+    """An object on z = 0 around the z axis; ``size (3,)`` in metres; ``kind`` is "paper", "brick" or "lid"."""
 
     kind: str
     size: tuple[float, float, float]
@@ -61,7 +61,7 @@ class Dust:
         rng = np.random.default_rng(self.seed)
         looks, solid = self._shape(rng)
         image = paint(self.color)
-        if self.kind == "paper":  # every crease has its own shade
+        if self.kind == "paper":  # a different shade for every face
             image = (image[:1, :1] * rng.uniform(0.7, 1.0, (16, 16, 1))).astype(np.uint8)
         for index, surface in enumerate(looks):
             add_surface(spec, body, f"{name}-{index}", surface, image, shine=0.3)
@@ -69,7 +69,7 @@ class Dust:
         return body
 
     def _shape(self, rng: np.random.Generator) -> tuple[list[Surface], FloatArray]:
-        """Surfaces to look at, and the points ``(N, 3)`` whose hull is touched."""
+        """Visual surfaces, and points ``(N, 3)`` whose convex hull is the collision shape."""
         x, y, z = self.size
         if self.kind == "lid":
             rim = [(0.0, 0.0), (x / 2, 0.0), (x / 2, 0.9 * z), (0.46 * x, z), (0.0, z)]
@@ -84,13 +84,13 @@ class Dust:
         points = directions / np.linalg.norm(directions, axis=1, keepdims=True) * np.array(self.size) / 2
         points = points * rng.uniform(0.85, 1.0, (PAPER_POINTS, 1))
         points[:, 2] += z / 2
-        points[points[:, 2] < 0.2 * z, 2] = 0.0  # it was trodden on, and lies flat
+        points[points[:, 2] < 0.2 * z, 2] = 0.0  # flattened
         points = np.concatenate([points, [[0.3 * x, 0, 0], [-0.15 * x, 0.26 * y, 0], [-0.15 * x, -0.26 * y, 0]]])
         return [_faceted(points, rng)], points
 
 
 def _faceted(points: FloatArray, rng: np.random.Generator) -> Surface:
-    """The hull of ``points (N, 3)``, each triangle with a shade of its own."""
+    """The convex hull of ``points (N, 3)``, each triangle with a different shade."""
     hull = ConvexHull(points)
     triangles = hull.simplices.copy()
     corners = points[triangles]

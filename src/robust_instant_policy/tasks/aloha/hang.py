@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from robust_instant_policy.tasks.aloha.cell import AlohaEnv
-from robust_instant_policy.tasks.aloha.hands import back, bearing, grip, over
 from robust_instant_policy.tasks.aloha.hanger import ROD_RADIUS_M, Hanger, Stand
+from robust_instant_policy.tasks.aloha.tool_poses import back, bearing, grip, over
 from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.poses import facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
@@ -15,11 +15,11 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 HANGER_X_RANGE_M, HANGER_Y_RANGE_M = (-0.21, -0.17), (-0.05, 0.05)
 HANGER_YAW_RAD = np.deg2rad(10)
 STAND_X_RANGE_M, STAND_Y_RANGE_M = (0.08, 0.15), (-0.14, 0.14)
-STAND_YAW_RAD = np.deg2rad(12)  # to either side of facing the arm
+STAND_YAW_RAD = np.deg2rad(12)  # deviation from facing the arm, to either side
 
-SLOW_M_S = 0.15  # a hanger that still swings is hung; one that falls is faster
+SLOW_M_S = 0.15  # a hanging hanger may swing; a falling one is faster
 
-PITCH_RAD = np.deg2rad(-10)  # of the hand when it comes down
+PITCH_RAD = np.deg2rad(-10)  # of the descending gripper
 HOLD_M = 0.016  # of the neck's length, from its foot
 BEYOND_M = 0.0025  # fingertips past the neck
 APPROACH_M = 0.08
@@ -27,7 +27,7 @@ LIFT_M = 0.08
 TURN_FIRST_RAD = np.deg2rad(20)
 INWARDS_M = 0.035  # from the rod's free end to where the hanger hangs
 SHORT_M = 0.07  # of that place, where the hanger is first held up
-DROP_M = 0.003  # that the hook is above the rod when it is let go
+DROP_M = 0.003  # of the hook above the rod at release
 DRAW_BACK_M = 0.09
 
 
@@ -56,7 +56,7 @@ class HangEnv(AlohaEnv):
 
 
 def hang(env: HangEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Take the hanger by its neck, turn it up, thread its hook over the rod, lower it, let go and draw back."""
+    """Grasp the hanger at its neck, rotate it up, move the hook over the rod, lower it, release and retreat."""
     lying = env.pose_of("hanger")
     yaw = float(np.arctan2(lying[1, 0], lying[0, 0]))
     neck = lying[:3, 3] + HOLD_M * lying[:3, 0]

@@ -38,7 +38,7 @@ DARK: Color = (0.13, 0.13, 0.14)
 
 @dataclass(frozen=True)
 class Hanger:
-    """Lies in the xy plane, its hook towards x, the foot of its neck at the origin; lengths in metres.
+    """A hanger in the xy plane, its hook towards x, the foot of its neck at the origin; lengths in metres.
 
     ``hook`` is the radius of the hook's middle line, ``neck`` the length of the straight part under it.
     """
@@ -63,12 +63,12 @@ class Hanger:
 
     @property
     def hook_middle(self) -> float:
-        """Where the hook's centre is along x."""
+        """Position of the hook's centre along x."""
         return self.neck + 0.020
 
     @property
     def hang_height(self) -> float:
-        """How far the place on which it hangs, inside the hook, is along x."""
+        """Position along x of the contact point inside the hook."""
         return self.hook_middle + self.hook - self.bar
 
     def line(self) -> FloatArray:

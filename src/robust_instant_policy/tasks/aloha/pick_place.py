@@ -18,13 +18,13 @@ X_RANGE_M, Y_RANGE_M = (-0.21, 0.0), (-0.20, 0.20)
 APART_M = 0.17  # at least, between the middles of bottle and bowl
 
 GRASP_SHARE = 0.55  # of the body's height: where the fingertips hold it
-ABOVE_M = 0.06  # of the fingertips over the cap, coming and going
+ABOVE_M = 0.06  # of the fingertips over the cap, before and after
 CARRY_M = 0.035  # of the bottle's foot over the bowl's rim
 RELEASE_M = 0.012  # of the bottle's foot over the bowl's floor
 
 
 class PickPlaceEnv(AlohaEnv):
-    """Success: the bottle rests in the bowl, off the table, let go of."""
+    """Success: the bottle rests in the bowl, off the table, released."""
 
     bottle: Bottle
     bowl: Bowl
@@ -52,7 +52,7 @@ class PickPlaceEnv(AlohaEnv):
 def apart(
     rng: np.random.Generator, x_range: tuple[float, float], y_range: tuple[float, float], distance: float
 ) -> FloatArray:
-    """Two places ``(2, 2)`` anywhere in a rectangle, at least ``distance`` from each other, in metres."""
+    """Two random positions ``(2, 2)`` in a rectangle, at least ``distance`` from each other, in metres."""
     while True:
         places = np.stack([rng.uniform(*x_range, 2), rng.uniform(*y_range, 2)], axis=1)
         if np.linalg.norm(places[0] - places[1]) >= distance:
@@ -60,7 +60,7 @@ def apart(
 
 
 def pick_and_place(env: PickPlaceEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Hold the bottle from above, carry it over the rim, set it down in the bowl's middle, and let go."""
+    """Grasp the bottle from above, carry it over the rim, set it down in the bowl's middle, and release."""
     x, y = env.pose_of("bottle")[:2, 3].tolist()
     to_x, to_y = env.pose_of("bowl")[:2, 3].tolist()
     hold = GRASP_SHARE * env.bottle.height

@@ -1,7 +1,7 @@
-"""Which OpenGL MuJoCo renders with here: EGL or OSMesa, neither of which needs a screen or a graphics card.
+"""Selection of MuJoCo's OpenGL library: EGL or OSMesa, neither of which needs a screen or a graphics card.
 
-MuJoCo binds itself to one library when it is imported, and PyOpenGL never lets go of the first one it loaded. So each
-is tried in a process of its own. ``python -m`` this module to see what is chosen.
+MuJoCo selects one library at import, and PyOpenGL cannot change the first one it loaded. So each is tested in a
+separate process. ``python -m`` this module prints the selection.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import cache
 
 from robust_instant_policy.errors import RendererError
 
-VARIABLE = "MUJOCO_GL"  # MuJoCo's own; what a user sets there stays
+VARIABLE = "MUJOCO_GL"  # MuJoCo's variable; a value set by the user is kept
 BACKENDS = ("egl", "osmesa")
 TIMEOUT_S = 60
 MODULE = "robust_instant_policy.tasks.aloha.renderer"  # not `__name__`, which is "__main__" when it is run
@@ -32,13 +32,13 @@ def require_renderer() -> str:
             f"MuJoCo has no renderer ({said}); run: make setup (or install libegl1 and libgl1-mesa-dri, or libosmesa6)"
         )
     os.environ[VARIABLE] = works[0]
-    if "mujoco" in sys.modules:  # imported before it was known what to render with
+    if "mujoco" in sys.modules:  # imported before the library was selected
         importlib.reload(importlib.import_module("mujoco.rendering.classic.gl_context"))
     return dict(zip(backends, answers, strict=True))[works[0]][1]
 
 
 def _try(backend: str) -> tuple[bool, str]:
-    """Whether ``backend`` renders, and its name, or else why not."""
+    """Whether ``backend`` renders, with its name or the reason of the failure."""
     environment = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
     command = [sys.executable, "-m", MODULE, "once"]
     try:
@@ -57,7 +57,7 @@ def _try(backend: str) -> tuple[bool, str]:
 
 
 def _render() -> str:
-    """Draw a ball and name what drew it."""
+    """Render a ball and return the name of the renderer."""
     import mujoco
 
     spec = mujoco.MjSpec()

@@ -2,7 +2,7 @@
 
 Shapes, masses and joint ranges are the package's. Its drives are stiffer than any servo and its collision shapes are
 the fingers' convex hulls; both are replaced here: position drives with the torques that Robotis publishes for the
-servos (Trossen Robotics lists which joint has which), and flat pads where the fingers touch things.
+servos (Trossen Robotics lists the servo of each joint), and flat pads at the contact areas of the fingers.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from robust_instant_policy.motion.kinematics import Kinematics
 
 MODEL_PATH = Path(gym_aloha.__file__).parent / "assets" / "bimanual_viperx_transfer_cube.xml"
 
-ARMS = {"left": "vx300s_left", "right": "vx300s_right"}  # as tasks and as the model call them
+ARMS = {"left": "vx300s_left", "right": "vx300s_right"}  # names in tasks and in the model
 BASE_X_M = 0.469  # of the bases, to the left and right of the world's origin (gym-aloha)
 
 ARM_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
 FINGERS = ("left_finger", "right_finger")
-HAND = "gripper_link"
+GRIPPER_LINK = "gripper_link"
 TOOL = "tool"
 
-TOOL_LENGTH_M = 0.1537  # from the axis that turns the wrist to the tips of the fingers
+TOOL_LENGTH_M = 0.1537  # from the wrist joint to the fingertips
 CLOSED_M = 0.0224  # reading of a finger's joint at which the pads touch
 FINGER_TRAVEL_M = 0.057 - CLOSED_M
 FINGER_SPEED_M_S = 0.10
@@ -38,14 +38,14 @@ PAD_TORSION_M, PAD_ROLLING_M = 0.01, 1e-3
 SERVO_TORQUE_NM = (10.6, 21.2, 21.2, 10.6, 10.6, 4.1)  # XM540-W270, two of them at shoulder and elbow, XM430-W350
 JOINT_SPEED_LIMIT_RAD_S = 0.8 * np.pi  # XM540-W270: 30 rev/min without load
 TOOL_SPEED_LIMIT_M_S = 0.6
-TURN_TOLERANCE_RAD = 0.15  # where hand and forearm come into line, which is in the middle of this arm's range
+TURN_TOLERANCE_RAD = 0.15  # needed where gripper and forearm align, in the middle of this arm's range
 RELUCTANCE_M, ORIENTATION_COST_M = 0.008, 0.05
-STIFFNESS = (300.0, 500.0, 400.0, 60.0, 60.0, 30.0)  # N m/rad: 5 mm into the table press with some 10 N
+STIFFNESS = (300.0, 500.0, 400.0, 60.0, 60.0, 30.0)  # N m/rad: 5 mm into the table gives about 10 N
 LAG_S = 0.03
-ARMATURE = 0.02  # kg m², the rotors' inertia seen through their gears
-FINGER_STIFFNESS = 8e3  # N/m: what is thicker than a few millimetres is held with the full force
+ARMATURE = 0.02  # kg m², the rotors' inertia after the gears
+FINGER_STIFFNESS = 8e3  # N/m: objects thicker than a few millimetres are held with the full force
 
-HOME_JOINTS = (-1.4, -0.43, 0.434, 0.0, 1.567, 0.0)  # hand down, beside the arm, out of the camera's sight
+HOME_JOINTS = (-1.4, -0.43, 0.434, 0.0, 1.567, 0.0)  # gripper down, beside the arm, outside the camera's view
 PARKED_JOINTS = (0.0, -1.8, 1.6, 0.0, 0.3, 0.0)
 
 TRIANGLE = GripperTriangle(length=TOOL_LENGTH_M, opening=2 * FINGER_TRAVEL_M)
@@ -55,7 +55,7 @@ GREY = (0.30, 0.30, 0.32, 1.0)
 
 
 def two_arms() -> mujoco.MjSpec:
-    """A model with nothing in it but the two arms, facing each other along x, the origin midway on the table."""
+    """A model of the two arms alone, facing each other along x, the origin midway on the table."""
     spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
     spec.modelname = "aloha"
     for things in (spec.keys, spec.actuators, spec.cameras, spec.lights, spec.textures, spec.materials):
@@ -73,12 +73,12 @@ def two_arms() -> mujoco.MjSpec:
 
 def _refit(spec: mujoco.MjSpec, arm: str) -> None:
     """Give an arm its tool frame, pads, colours and drives."""
-    hand = spec.body(f"{arm}/{HAND}")
-    # The tool's z is the hand's approach x; its y is against the hand's y, so that the tool points straight down with
-    # yaw 0 where the arm reaches out without turning its wrist.
+    gripper_link = spec.body(f"{arm}/{GRIPPER_LINK}")
+    # The tool's z is the gripper link's x; its y is minus the link's y, so that the tool points straight down with
+    # yaw 0 where the arm reaches forward without rotating its wrist.
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, np.array([0.0, 0, 1, 0, -1, 0, 1, 0, 0]))
-    hand.add_site(name=f"{arm}/{TOOL}", pos=[TOOL_LENGTH_M, 0, 0], quat=quaternion, rgba=[0, 0, 0, 0])
+    gripper_link.add_site(name=f"{arm}/{TOOL}", pos=[TOOL_LENGTH_M, 0, 0], quat=quaternion, rgba=[0, 0, 0, 0])
 
     for geom in spec.geoms:
         if geom.name.startswith(arm):
@@ -88,7 +88,7 @@ def _refit(spec: mujoco.MjSpec, arm: str) -> None:
             geom.contype, geom.conaffinity = _touches(arm) if solid else (0, 0)
     for finger, side in zip(FINGERS, (1, -1), strict=True):
         body = spec.body(f"{arm}/{finger}_link")
-        inner = -side * CLOSED_M  # the pad's face, in the finger's own frame
+        inner = -side * CLOSED_M  # the pad's face, in the finger's frame
         _pad(body, (0.0585, inner + side * 0.0025, 0.0), (0.0265, 0.0025, 0.0055), _touches(arm))
         _pad(body, (0.0150, inner + side * 0.0050, 0.0), (0.0170, 0.0050, 0.0250), _touches(arm))
 
@@ -140,7 +140,7 @@ def _servo(spec: mujoco.MjSpec, name: str, stiffness: float, damping: float, for
 
 
 def viperx(side: str) -> Arm:
-    """The arm on the ``side`` "left" or "right", as the executor sees it."""
+    """The arm on the ``side`` "left" or "right", for motion planning."""
     spec = two_arms()
     for name in list(spec.actuators) + list(spec.equalities):
         spec.delete(name)

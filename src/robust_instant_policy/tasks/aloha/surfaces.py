@@ -1,4 +1,4 @@
-"""What objects are made of: painted meshes to look at, and solid shapes to touch."""
+"""Parts of objects: textured visual meshes, and collision shapes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from robust_instant_policy.geometry import FloatArray
 Image = NDArray[np.uint8]
 Body = Any  # mujoco.MjsBody
 
-VISUAL_GROUP, SOLID_GROUP = 1, 3  # the renderer shows the former only
+VISUAL_GROUP, SOLID_GROUP = 1, 3  # only the former is rendered
 ROLLING_M = 2e-4  # resistance of small hard things to rolling
 TORSION_M = 5e-3
 
@@ -30,7 +30,7 @@ class Surface:
 
 
 def revolved(profile: ArrayLike, sides: int = 48, flat: bool = False) -> Surface:
-    """The surface that ``profile (N, 2)`` of (radius, height) sweeps around z; u runs around it, v along it.
+    """The surface of revolution of ``profile (N, 2)`` (radius, height) about z; u runs around it, v along it.
 
     ``flat`` keeps its ``sides`` as facets with an edge between them.
     """
@@ -61,7 +61,7 @@ def revolved(profile: ArrayLike, sides: int = 48, flat: bool = False) -> Surface
 
 
 def box_surface(size: ArrayLike) -> Surface:
-    """A box of full ``size (3,)`` about the origin; every face shows the whole texture."""
+    """A box of full ``size (3,)`` about the origin; every face has the whole texture."""
     half = np.asarray(size, dtype=np.float64) / 2
     vertices: list[list[FloatArray]] = []
     faces: list[list[int]] = []
@@ -109,7 +109,7 @@ def _sheet(rows: FloatArray, u: FloatArray, v: FloatArray) -> Surface:
 
 
 def add_surface(spec: mujoco.MjSpec, body: Body, name: str, surface: Surface, image: Image, shine: float = 0.2) -> None:
-    """Show ``surface`` on ``body``, painted with sRGB ``image (H, W, 3)``; nothing can touch it."""
+    """Show ``surface`` on ``body``, textured with sRGB ``image (H, W, 3)``; without collision."""
     mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     mesh.uservert = surface.vertices.astype(np.float32).ravel()
     mesh.userface = surface.faces.astype(np.int32).ravel()
@@ -145,7 +145,7 @@ def add_solid(
     friction: float = 0.6,
     **more: Any,
 ) -> Any:
-    """Something to touch: a primitive of MuJoCo's ``size`` (half lengths), turned by ``rotation (3, 3)``."""
+    """A collision shape: a primitive of MuJoCo's ``size`` (half lengths), rotated by ``rotation (3, 3)``."""
     quaternion = np.array([1.0, 0.0, 0.0, 0.0])
     if rotation is not None:
         quaternion = Rotation.from_matrix(rotation).as_quat()[[3, 0, 1, 2]]
@@ -167,7 +167,7 @@ def add_solid(
 def add_hull(
     spec: mujoco.MjSpec, body: Body, name: str, points: ArrayLike, *, friction: ArrayLike = 0.6, **more: Any
 ) -> Any:
-    """Something to touch: the hull of ``points (N, 3)``; ``friction`` is sliding alone, or all three of MuJoCo's."""
+    """A collision shape: the hull of ``points (N, 3)``; ``friction`` is sliding only, or MuJoCo's three values."""
     spec.add_mesh(name=name).uservert = np.asarray(points, dtype=np.float32).ravel()
     frictions = np.array([0.0, TORSION_M, ROLLING_M])
     frictions[: np.size(friction)] = friction
@@ -191,13 +191,13 @@ def add_bar(body: Body, start: ArrayLike, stop: ArrayLike, radius: float, **more
 
 
 def free_body(spec: mujoco.MjSpec, name: str, pose: FloatArray) -> Body:
-    """A body that can be moved, at ``pose (4, 4)``."""
+    """A free body at ``pose (4, 4)``."""
     body = fixed_body(spec, name, pose)
     body.add_freejoint(name=name)
     return body
 
 
 def fixed_body(spec: mujoco.MjSpec, name: str, pose: FloatArray) -> Body:
-    """A body that stays at ``pose (4, 4)``."""
+    """A fixed body at ``pose (4, 4)``."""
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
     return spec.worldbody.add_body(name=name, pos=pose[:3, 3], quat=quaternion)

@@ -1,4 +1,4 @@
-"""Sweep something into a dustpan: one hand holds the pan, the other the brush."""
+"""Sweep an object into a dustpan: one gripper holds the pan, the other the brush."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from robust_instant_policy.geometry import FloatArray, invert_pose, make_pose, t
 from robust_instant_policy.tasks.aloha.broom import Brush, Dustpan
 from robust_instant_policy.tasks.aloha.cell import CONTROL_HZ, AlohaEnv
 from robust_instant_policy.tasks.aloha.dust import Dust
-from robust_instant_policy.tasks.aloha.hands import grip, over
+from robust_instant_policy.tasks.aloha.tool_poses import grip, over
 from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.object_sets import draw_object
 from robust_instant_policy.tasks.poses import downward, facing
@@ -23,27 +23,27 @@ DUST_X_RANGE_M, DUST_Y_RANGE_M = (-0.16, -0.08), (-0.10, 0.07)
 PAN_X_RANGE_M, PAN_Y_RANGE_M = (0.00, 0.05), (-0.22, -0.16)  # of its lip
 BRUSH_YAW_RANGE_RAD, PAN_YAW_RANGE_RAD = np.deg2rad((-8, 8)), np.deg2rad((-10, 10))
 
-TOUCHED_SECONDS = 0.3  # for which the held brush has to touch the table
+TOUCHED_SECONDS = 0.3  # minimum contact of the held brush with the table
 
 HOLD_M = 0.052  # of the handle's length, from its top
 ABOVE_M = 0.05
 LIFT_M = 0.06
-AWAY_M = 0.04  # that the brush is lifted by at the end
-BEHIND_M = 0.045  # of the dust's near side, where the brush comes down
+AWAY_M = 0.04  # lift of the brush at the end
+BEHIND_M = 0.045  # behind the object, where the brush descends
 PRESS_M = 0.002  # of the bristles into the table
-INTO_M = 0.055  # how far the brush goes on from the lip
+INTO_M = 0.055  # travel of the brush beyond the lip
 
-AHEAD_M = 0.125  # of the dust, where the pan's lip is held
-TILT_RAD = np.deg2rad(40)  # of the hand that holds the pan, away from the other
-BEYOND_M = 0.012  # how far its fingertips reach past the handle's middle
-LIP_DOWN_RAD = np.deg2rad(2.5)  # that the pan is tilted by, so that its lip lies on the table
-CARRY_M = 0.03  # that the pan is lifted by
+AHEAD_M = 0.125  # ahead of the object, where the pan's lip is held
+TILT_RAD = np.deg2rad(40)  # of the gripper at the pan, away from the other one
+BEYOND_M = 0.012  # of its fingertips past the handle's middle
+LIP_DOWN_RAD = np.deg2rad(2.5)  # tilt of the pan, so that its lip lies on the table
+CARRY_M = 0.03  # lift of the pan
 LEFT, RIGHT = 0, 1
 
 
 class SweepEnv(AlohaEnv):
-    """Success: the object lies in the dustpan, which is held or on the table, swept there by a held brush that touched
-    the table."""
+    """Success: the object lies in the dustpan, which is held or on the table, and the held brush touched the
+    table."""
 
     end_effectors: ClassVar[tuple[str, ...]] = ("left", "right")
     beside = ((0.02, -0.95, 0.60), (0.0, 0.0, 0.08))
@@ -74,15 +74,15 @@ class SweepEnv(AlohaEnv):
         if not (self.pan.lip < x < self.pan.depth and abs(y) < self.pan.width / 2 and z < self.pan.wall):
             return f"the object is not in the dustpan, but {-1e3 * x:.0f} mm before its lip"
         if not (self.is_held("dustpan", "right") or self.touch("dustpan", "world") > 0):
-            return "the object is in the dustpan, but that is neither held nor on the table"
+            return "the object is in the dustpan, but the dustpan is neither held nor on the table"
         if self._touched < TOUCHED_SECONDS:
-            return "the object is in the dustpan, but the brush hardly touched the table"
+            return "the object is in the dustpan, but the brush touched the table too briefly"
         return ""
 
 
 def sweep(env: SweepEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Hold the pan ahead of the dust with one hand; with the other take the brush by its handle, set it down behind
-    the dust, push that over the lip, and lift the brush."""
+    """Hold the pan ahead of the object with one gripper; with the other grasp the brush at its handle, set it down
+    behind the object, push the object over the lip, and lift the brush."""
     brush, dust, pan = (env.pose_of(name) for name in ("brush", "dust", "dustpan"))
 
     def at(x: float, y: float, height: float, yaw: float = 0.0) -> FloatArray:
@@ -91,7 +91,7 @@ def sweep(env: SweepEnv, rng: np.random.Generator) -> list[Stroke]:
     def holding(pan: FloatArray, height: float = 0.0) -> FloatArray:
         return (pan @ grip(over(env.pan.grip, height), TILT_RAD, np.pi, BEYOND_M))[None]
 
-    # The brush stays square to the table and goes straight on, over the lip.
+    # The brush stays perpendicular to the table and moves straight over the lip.
     hold = env.brush.height - HOLD_M
     x, y = brush[:2, 3].tolist()
     yaw = float(np.arctan2(brush[1, 0], brush[0, 0]))
@@ -102,13 +102,13 @@ def sweep(env: SweepEnv, rng: np.random.Generator) -> list[Stroke]:
     ahead = make_pose(Rotation.from_euler("y", -LIP_DOWN_RAD).as_matrix(), (dust_x + AHEAD_M, dust_y, 0.0))
 
     return [
-        Stroke(holding(pan, ABOVE_M), closed=False, free=True, error=0.003, hand=RIGHT),
+        Stroke(holding(pan, ABOVE_M), closed=False, free=True, error=0.003, arm=RIGHT),
         Stroke(at(x, y, env.brush.height + ABOVE_M, yaw), closed=False, free=True, error=0.003),
-        Stroke(holding(pan), closed=True, speed=0.10, error=0.0015, hand=RIGHT),
+        Stroke(holding(pan), closed=True, speed=0.10, error=0.0015, arm=RIGHT),
         Stroke(at(x, y, hold, yaw), closed=True, speed=0.10, error=0.0015, waits=True),
-        Stroke(holding(pan, CARRY_M), closed=True, speed=0.12, error=0.003, hand=RIGHT),
-        Stroke(holding(ahead, CARRY_M), closed=True, speed=0.16, error=0.003, hand=RIGHT),
-        Stroke(holding(ahead, -PRESS_M), closed=True, speed=0.08, error=0.0015, hand=RIGHT),
+        Stroke(holding(pan, CARRY_M), closed=True, speed=0.12, error=0.003, arm=RIGHT),
+        Stroke(holding(ahead, CARRY_M), closed=True, speed=0.16, error=0.003, arm=RIGHT),
+        Stroke(holding(ahead, -PRESS_M), closed=True, speed=0.08, error=0.0015, arm=RIGHT),
         Stroke(at(x, y, hold + LIFT_M, yaw), closed=True, speed=0.12, error=0.003),
         Stroke(at(behind, dust_y, hold + LIFT_M), closed=True, speed=0.20, error=0.004),
         Stroke(at(behind, dust_y, hold - PRESS_M), closed=True, speed=0.10, error=0.0015, pause=0.2),

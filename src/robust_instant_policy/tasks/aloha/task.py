@@ -1,4 +1,4 @@
-"""The five tasks of the ALOHA cell, behind the contract of `tasks.task.Task`."""
+"""The five tasks of the ALOHA cell as `tasks.task.Task`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from robust_instant_policy.tasks.aloha.cell import CONTROL_HZ, WORKSPACE, AlohaE
 from robust_instant_policy.tasks.aloha.robot import viperx
 from robust_instant_policy.tasks.simulated_task import SimulatedTask, TaskSpec, Timing
 
-# "recorded at 10 Hz, but will be 1 Hz during the test phase to ensure stability" (Oh et al. 2025, Sec. V-A)
+# "recorded at 10 Hz, but will be 1 Hz during the test phase to ensure stability" (Oh et al. 2025, Sec. V-A.1)
 TIMING = Timing(control_hz=CONTROL_HZ, record_every=5, frame_every=10, execute_hz=1.0)
 
 
 class CellTask(SimulatedTask):
-    """A task of one arm or both; ``objects`` as in `tasks.make_task`, and there is one source of ``assets``."""
+    """A task of one arm or both; ``objects`` as in `tasks.make_task`, with one source of ``assets``."""
 
     def __init__(self, spec: TaskSpec, objects: str, assets: str):
         env = gymnasium.make(spec.env_id, objects=objects, obs_mode="none")

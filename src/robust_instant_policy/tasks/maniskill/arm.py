@@ -1,4 +1,4 @@
-"""The UR5e with its Hand-E, as the executor sees it."""
+"""The UR5e with the Hand-E gripper for motion planning."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from robust_instant_policy.tasks.maniskill.robot import (
     ARM_JOINTS,
     FINGER_SPEED_M_S,
     FINGER_TRAVEL_M,
-    PALM_TRIANGLE,
+    GRIPPER_TRIANGLE,
     TOOL_LINK,
     URDF_PATH,
 )
 
-EXECUTE_HZ = 5.5  # "executed at 5.5 Hz" (Oh et al. 2025, Sec. V-A)
+EXECUTE_HZ = 5.5  # "5.5 Hz during the test phase" (Oh et al. 2025, Sec. V-A.1)
 JOINT_SPEED_LIMIT_RAD_S = 0.8 * np.pi  # the joints' 180 degrees/s, with a margin for tracking
 TOOL_SPEED_LIMIT_M_S = 1.0  # "typical TCP speed 1 m/s" (UR5e data sheet)
 
@@ -27,9 +27,9 @@ TURN_TOLERANCE_RAD = 0.05
 
 
 def ur5e_kinematics(base_position: ArrayLike) -> Kinematics:
-    """The arm standing at ``base_position (3,)`` metres, its base unturned."""
+    """The arm with its base at ``base_position (3,)`` metres, not rotated."""
     spec = mujoco.MjSpec.from_file(str(URDF_PATH))
-    spec.compiler.fusestatic = False  # the tool frame is a link of its own
+    spec.compiler.fusestatic = False  # the tool frame is a separate link
     return Kinematics(spec.compile(), TOOL_LINK, "body", len(ARM_JOINTS), make_pose(np.eye(3), base_position))
 
 
@@ -39,7 +39,7 @@ def ur5e_hande() -> Arm:
         name="hand-e",
         kinematics=ur5e_kinematics(BASE_POSITION_M),
         home=np.array(HOME_JOINTS),
-        triangle=PALM_TRIANGLE,
+        triangle=GRIPPER_TRIANGLE,
         finger_travel=FINGER_TRAVEL_M,
         finger_speed=FINGER_SPEED_M_S,
         joint_speed=JOINT_SPEED_LIMIT_RAD_S,

@@ -1,4 +1,4 @@
-"""Small cabinets with one door, built of boards, in two families."""
+"""Small cabinets with one door, built of boxes, in two families."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Cabinet:
 
     @classmethod
     def draw_seen(cls, number: int, rng: np.random.Generator) -> Cabinet:
-        """Low and wide, painted or of oak, with a bar to pull at."""
+        """Low and wide, painted or of oak, with a bar handle."""
         bodies = (Paint((0.80, 0.66, 0.46), grain=True), Paint((0.42, 0.55, 0.60)), WHITE)
         doors = (Paint((0.30, 0.38, 0.47)), Paint((0.62, 0.30, 0.22)), Paint((0.25, 0.45, 0.36)))
         return cls(

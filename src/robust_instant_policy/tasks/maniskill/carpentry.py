@@ -1,4 +1,4 @@
-"""Putting links together from boxes and cylinders that are seen and touched alike."""
+"""Links made of boxes and cylinders, with equal visual and collision shapes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WOOD_DENSITY = 600.0  # kg/m³
 def add_box(
     builder: Any, size: ArrayLike, centre: ArrayLike, paint: Paint, *, collide: bool = True, yaw: float = 0.0
 ) -> None:
-    """A box of ``size (3,)`` m around ``centre (3,)`` m in the link's frame, turned by ``yaw`` rad about z."""
+    """A box of ``size (3,)`` m around ``centre (3,)`` m in the link's frame, rotated by ``yaw`` rad about z."""
     half = np.asarray(size, dtype=np.float64) / 2
     pose = sapien.Pose(centre, [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
     seed = int(1e4 * abs(half.sum() + np.abs(centre).sum()))
@@ -52,7 +52,7 @@ def add_ball(builder: Any, radius: float, centre: ArrayLike, paint: Paint, *, co
 
 
 def hinge(builder: Any, kind: str, at: ArrayLike, axis: ArrayLike, limits: tuple[float, float]) -> None:
-    """Hang the link on its parent: ``kind`` ``"revolute"`` about, or ``"prismatic"`` along, ``axis (3,)`` at ``at``.
+    """Join the link to its parent: ``kind`` ``"revolute"`` about, or ``"prismatic"`` along, ``axis (3,)`` at ``at``.
 
     The link's own frame is that of its parent moved to ``at (3,)``.
     """
@@ -61,7 +61,7 @@ def hinge(builder: Any, kind: str, at: ArrayLike, axis: ArrayLike, limits: tuple
 
 
 def _turn_x_to(direction: np.ndarray) -> list[float]:
-    """Quaternion (w, x, y, z) that turns the x axis to ``direction (3,)``."""
+    """Quaternion (w, x, y, z) that rotates the x axis to ``direction (3,)``."""
     turned, _ = Rotation.align_vectors(direction[None] / np.linalg.norm(direction), [[1.0, 0.0, 0.0]])
     x, y, z, w = turned.as_quat()
     return [w, x, y, z]

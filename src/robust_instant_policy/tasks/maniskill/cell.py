@@ -1,4 +1,4 @@
-"""The cell all tasks share: table, arm, top-view RGB-D camera, and a camera for videos.
+"""The cell of all ManiSkill tasks: table, arm, top-view RGB-D camera, and a camera for videos.
 
 The world's origin is on the table top, x away from the robot, z up. The image's top points along +x.
 """
@@ -21,24 +21,24 @@ from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.tasks.maniskill.robot import FINGER_TRAVEL_M, UR5eHandE
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 
-RECORD_HZ = 55.0  # "recorded at 55 Hz" (Oh et al. 2025, Sec. V-A)
+RECORD_HZ = 55.0  # "recorded at 55 Hz" (Oh et al. 2025, Sec. V-A.1)
 SIM_HZ = 220
 
 BASE_POSITION_M = (-0.5, 0.0, 0.0)
-HOME_JOINTS = (0.9, -1.9, 2.2, -1.87, -1.5708, -0.67)  # beside the table top, out of the camera's sight
+HOME_JOINTS = (0.9, -1.9, 2.2, -1.87, -1.5708, -0.67)  # beside the table top, outside the camera's view
 
 CAMERA_POSITION_M = (0.06, 0.0, 1.3)
-CAMERA_VIEW_M = 0.8  # side of the square of table top that the camera sees
+CAMERA_VIEW_M = 0.8  # side of the square of the table top in the image
 CAMERA_PIXELS = 256
 VIDEO_WIDTH, VIDEO_HEIGHT = 480, 360
 
-STILL_RAD_S = 0.2  # joint speed below which ManiSkill's tasks take an arm to be at rest
+STILL_RAD_S = 0.2  # joint speed below which an arm is at rest, as in ManiSkill's tasks
 
 WORKSPACE = np.array([[-0.34, -0.4, -0.005], [0.46, 0.4, 0.4]])
 
 
 class CellEnv(BaseEnv):
-    """Base of the five environments; a subclass adds its objects and says when they are where they should be."""
+    """Base of the five environments; a subclass adds its objects and its condition of success."""
 
     SUPPORTED_ROBOTS = ("ur5e_hande",)
     SUPPORTED_REWARD_MODES = ("sparse", "none")
@@ -55,8 +55,8 @@ class CellEnv(BaseEnv):
     ):
         """``objects`` and ``assets`` as in `tasks.make_task`; everything else as in ManiSkill's environments."""
         self.objects, self.assets = objects, assets
-        # A physics scene that has been used orders its contacts differently from a new one, and the same push then
-        # ends millimetres elsewhere: only a new scene at every reset makes the same seed give the same episode.
+        # A used physics scene orders its contacts differently from a new one, which changes results by millimetres.
+        # With a new scene at every reset, the same seed gives the same episode.
         kwargs.setdefault("reconfiguration_freq", 1)
         super().__init__(*args, robot_uids=robot_uids, render_backend=render_backend, **kwargs)
 
@@ -84,8 +84,8 @@ class CellEnv(BaseEnv):
         self.table_scene.build()
 
     def _load_lighting(self, options: dict) -> None:
-        # Slanted, so that flat metal does not mirror a lamp into the camera above. Shadows would cost a renderer on
-        # the processor several times the rest of the image.
+        # Slanted, so that flat metal does not reflect a lamp into the camera. No shadows: on the CPU they would take
+        # several times as long to render as the rest of the image.
         self.scene.set_ambient_light([0.42, 0.42, 0.42])
         self.scene.add_directional_light([-0.45, 0.55, -1.0], [1.2, 1.2, 1.15])
         self.scene.add_directional_light([0.5, -0.5, -1.0], [0.5, 0.5, 0.55])
@@ -98,9 +98,9 @@ class CellEnv(BaseEnv):
         self._joints_before = self.agent.robot.get_qpos().clone()
 
     def advance(self, command: FloatArray) -> None:
-        """One control step, with joint angles and finger travel ``(7,)`` commanded, judging nothing.
+        """One control step, with joint angles and finger travel ``(7,)`` commanded, without evaluation.
 
-        `step` evaluates the task, too, which for an object in the hand takes longer than the physics.
+        `step` also evaluates the task, which for a grasped object takes longer than the physics.
         """
         self.agent.drive(command)
         self._before_control_step()
@@ -112,30 +112,30 @@ class CellEnv(BaseEnv):
         self._joints_before = self.agent.robot.get_qpos().clone()
 
     def failure(self) -> str:
-        """Why the task is not done, in words; nothing once it is."""
+        """Reason why the task is not done; empty if it is done."""
         raise NotImplementedError
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """What ManiSkill asks of an environment."""
+        """Evaluation in the form that ManiSkill requires."""
         return {"success": torch.tensor([not self.failure()])}
 
     def arm_is_still(self) -> bool:
         """Whether no arm joint moved faster than `STILL_RAD_S` over the last control step.
 
-        Judged by the angles: with something between the fingers PhysX reports joint speeds that move nothing.
+        Computed from the angles: with an object between the fingers PhysX reports wrong joint speeds.
         """
         moved = (self.agent.robot.get_qpos() - self._joints_before)[:, : len(HOME_JOINTS)]
         return bool(moved.abs().amax() * self.control_freq <= STILL_RAD_S)
 
     def draw(self, what: str) -> np.random.Generator:
-        """The episode's random numbers for ``what`` ("shape", "pose"), the same for the same seed."""
+        """Random generator of the episode for ``what`` ("shape", "pose"), determined by the seed."""
         return np.random.default_rng([int(self._episode_seed[0]), *what.encode()])
 
     def _get_obs_extra(self, info: dict) -> dict:
         return {"tcp_pose": self.agent.tcp.pose.raw_pose}
 
     def photograph(self) -> Observation:
-        """What the top-view camera sees now."""
+        """The current image of the top-view camera."""
         camera = self._sensors["top"]
         self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
         camera.capture()
@@ -154,7 +154,7 @@ class CellEnv(BaseEnv):
         )
 
     def scene_truth(self) -> SceneTruth:
-        """What each pixel of the top view shows, and where it is."""
+        """Ground truth of each pixel of the top view."""
         camera = self._sensors["top"]
         self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
         camera.capture()
@@ -174,5 +174,5 @@ class CellEnv(BaseEnv):
         return self.render_rgb_array()[0].cpu().numpy().astype(np.uint8)
 
     def tool_poses(self) -> FloatArray:
-        """Where the arm's tool frame is, ``(1, 4, 4)``."""
+        """Pose of the arm's tool frame, ``(1, 4, 4)``."""
         return self.agent.tcp._objs[0].pose.to_transformation_matrix().astype(np.float64)[None]

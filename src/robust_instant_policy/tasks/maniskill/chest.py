@@ -1,4 +1,4 @@
-"""Small chests of drawers, built of boards, in a family of sizes, colours and handles."""
+"""Small chests of drawers, built of boxes, with random sizes, colours and handles."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from robust_instant_policy.tasks.maniskill.paint import BLACK, STEEL, WHITE, Pai
 BOARD_M = 0.01
 FRONT_M = 0.014  # thickness of the drawer's front
 GAP_M = 0.003  # around the drawer's front
-HANDLE_M = 0.045  # how far handles stick out
-GRASP_REACH_M = 0.034  # from the front to where fingers take a handle
-SLIDE_DAMPING, SLIDE_FRICTION = 15.0, 0.05  # plain wooden runners
+HANDLE_M = 0.045  # protrusion of handles
+GRASP_REACH_M = 0.034  # from the front to the grasp point of a handle
+SLIDE_DAMPING, SLIDE_FRICTION = 15.0, 0.05  # of wooden runners
 
 BODIES = (
     Paint((0.80, 0.66, 0.46), grain=True),
@@ -66,7 +66,7 @@ class Chest:
 
     @property
     def handle_height(self) -> float:
-        """Middle of the handle over the table."""
+        """Height of the handle's middle above the table."""
         return self.height - BOARD_M - self.drawer_height / 2
 
     @property

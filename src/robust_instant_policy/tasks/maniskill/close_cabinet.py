@@ -1,4 +1,4 @@
-"""Push the open door of a small cabinet shut."""
+"""Push the open door of a small cabinet closed."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (0.08, 0.16), (-0.12, 0.06)  # of the middle of the cabinet's front, hinge on the +y side
 YAW_RANGE_RAD = np.deg2rad(20)
-OPEN_RANGE_RAD = np.deg2rad((50.0, 80.0))  # how far the door is open at the start
+OPEN_RANGE_RAD = np.deg2rad((50.0, 80.0))  # opening angle of the door at the start
 
-CLOSED_RAD = np.deg2rad(5)  # a door this little open counts as closed
+CLOSED_RAD = np.deg2rad(5)  # opening angle below which the door is closed
 STILL_M_S, STILL_RAD_S = 0.1, 1.0  # as in ManiSkill's cabinet tasks
 
 FINGER_RADIUS_M = 0.013  # of the closed fingers
-PUSH_SHARE = 0.72  # of the door's width, from the hinge, where a person pushes
-APPROACH_M = 0.04  # between fingers and door when the hand comes down beside it
+PUSH_SHARE = 0.72  # of the door's width, from the hinge: where the demonstrator pushes
+APPROACH_M = 0.04  # between fingers and door while the gripper descends
 FINGERS_BELOW_M = 0.035  # fingertips under the door's top edge
 ABOVE_M = 0.07
 PRESS_M = 0.003
@@ -62,11 +62,11 @@ class CloseCabinetEnv(CellEnv):
         angle = float(self.cabinet.position)
         if angle >= CLOSED_RAD:
             return f"the door is {np.rad2deg(angle):.1f} degrees open, {np.rad2deg(CLOSED_RAD):.0f} allowed"
-        return "" if self.cabinet.is_still(STILL_M_S, STILL_RAD_S) else "the door is shut but still moving"
+        return "" if self.cabinet.is_still(STILL_M_S, STILL_RAD_S) else "the door is closed but still moving"
 
 
-def shut(env: CloseCabinetEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Close the hand, come down outside the door, and push it round to the frame."""
+def push_closed(env: CloseCabinetEnv, rng: np.random.Generator) -> list[Stroke]:
+    """Close the gripper, descend outside the door, and push it to the frame."""
     door, height = env.door, env.door.top - FINGERS_BELOW_M
     radius = door.width * PUSH_SHARE * rng.uniform(0.95, 1.05)
     angle = float(env.cabinet.position[0])
@@ -89,10 +89,10 @@ def shut(env: CloseCabinetEnv, rng: np.random.Generator) -> list[Stroke]:
 
 SPEC = TaskSpec(
     name="close-cabinet",
-    description="push the cabinet's door shut",
-    goal="the cabinet's door is shut",
+    description="push the cabinet's door closed",
+    goal="the cabinet's door is closed",
     env_id="RIP-CloseCabinet-v1",
-    expert=shut,
+    expert=push_closed,
     object_sets=("seen", "unseen"),
     asset_sources=("code", "maniskill"),
 )

@@ -36,7 +36,7 @@ class Faucet:
 
     @classmethod
     def draw_seen(cls, number: int, rng: np.random.Generator) -> Faucet:
-        """Round columns, round levers that end in a coloured ball."""
+        """Round columns, round levers with a coloured ball at the end."""
         return cls(
             column=rng.uniform(0.018, 0.023),
             height=rng.uniform(0.08, 0.11),
@@ -66,7 +66,7 @@ class Faucet:
 
     @property
     def lever_height(self) -> float:
-        """Middle of the lever over the table."""
+        """Height of the lever's middle above the table."""
         return self.height + LEVER_GAP_M + self.column * 0.5
 
     @property

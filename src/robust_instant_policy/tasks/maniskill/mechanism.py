@@ -1,4 +1,4 @@
-"""Articulated objects, and what a hand needs to know of the part that moves.
+"""Articulated objects, and the geometry of the moving part that an expert needs.
 
 All positions are in the object's frame: on the table, z up, its -x side facing the robot at yaw 0.
 """
@@ -18,7 +18,7 @@ from robust_instant_policy.geometry import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Drawer:
-    """A closed drawer that slides out along -x by ``travel`` m; ``handle (3,)`` is where fingers take it."""
+    """A closed drawer that slides out along -x by ``travel`` m; ``handle (3,)`` is the grasp point."""
 
     handle: FloatArray
     travel: float
@@ -40,7 +40,7 @@ class Door:
 
 @dataclass(frozen=True, eq=False)
 class Lever:
-    """A lever that turns about the vertical through ``pivot (2,)``.
+    """A lever that rotates about the vertical axis through ``pivot (2,)``.
 
     Closed it points at angle ``start`` rad; it opens by ``turn`` rad, counter-clockwise where ``sign`` is 1.
     ``length``, ``half_width`` and ``height`` (of its middle) in metres.
@@ -78,7 +78,7 @@ class Mechanism:
 
     @property
     def position(self) -> torch.Tensor:
-        """How far ``joint`` is from its closed end, ``(1,)``, in rad or metres."""
+        """Distance of ``joint`` from its closed end, ``(1,)``, in rad or metres."""
         return (self.articulation.get_qpos() - self._closed)[:, self._index]
 
     def place(self, pose: FloatArray, position: float) -> None:
@@ -90,14 +90,14 @@ class Mechanism:
         self.articulation.set_qvel(torch.zeros_like(joints))
 
     def is_still(self, linear: float, angular: float) -> bool:
-        """Whether the moving link is no faster than ``linear`` m/s and ``angular`` rad/s."""
+        """Whether the moving link is not faster than ``linear`` m/s and ``angular`` rad/s."""
         link = self.moving_link
         slow = bool(torch.linalg.norm(link.linear_velocity) <= linear)
         return slow and bool(torch.linalg.norm(link.angular_velocity) <= angular)
 
 
 def closed_joints(articulation: Articulation) -> torch.Tensor:
-    """Joint positions ``(1, J)`` with everything shut: the lower limits, 0 where a joint has none."""
+    """Joint positions ``(1, J)`` with everything closed: the lower limits, 0 where a joint has none."""
     return articulation.get_qlimits()[:, :, 0].nan_to_num(0.0, 0.0, 0.0)
 
 

@@ -23,7 +23,7 @@ STILL_M_S, STILL_RAD_S = 0.1, 1.0  # as in ManiSkill's OpenCabinetDrawer
 
 ABOVE_M = 0.09
 FINGERS_BELOW_M = 0.010  # fingertips under the middle of the handle
-PULL_FURTHER_M = 0.004  # a person pulls until it stops
+PULL_FURTHER_M = 0.004  # the demonstrator pulls to the stop
 
 
 @register_env("RIP-OpenDrawer-v1", max_episode_steps=600)
@@ -57,7 +57,7 @@ class OpenDrawerEnv(CellEnv):
 
 
 def pull(env: OpenDrawerEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Come down with one finger on either side of the handle, close, pull straight out."""
+    """Descend with one finger on either side of the handle, close, pull straight out."""
     x, y, z = env.drawer.handle - (rng.uniform(-0.002, 0.002), 0.0, FINGERS_BELOW_M)
 
     def at(out: float, up: float) -> FloatArray:

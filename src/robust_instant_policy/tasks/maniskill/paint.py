@@ -1,4 +1,4 @@
-"""How surfaces look: plain paint, metal, wood grain."""
+"""Materials of surfaces: paint, metal, wood grain."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from robust_instant_policy.tasks.textures import Color, wood
 
 @dataclass(frozen=True)
 class Paint:
-    """``color`` in sRGB, each 0 to 1; ``grain`` draws wood fibres along the faces' length."""
+    """``color`` in sRGB, each 0 to 1; ``grain`` adds wood fibres along the faces' length."""
 
     color: Color
     roughness: float = 0.6
@@ -21,7 +21,7 @@ class Paint:
     grain: bool = False
 
     def material(self, seed: int = 0) -> sapien.render.RenderMaterial:
-        """A material of this paint; ``seed`` chooses the piece of wood."""
+        """A material of this paint; ``seed`` selects the wood texture."""
         material = sapien.render.RenderMaterial()
         material.roughness, material.metallic, material.specular = self.roughness, self.metallic, 0.3
         if self.grain:

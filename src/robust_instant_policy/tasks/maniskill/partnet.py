@@ -1,6 +1,6 @@
-"""ManiSkill's downloadable objects, where a user has them: YCB's banana, PartNet-Mobility's cabinets and faucets.
+"""ManiSkill's downloadable objects, if installed: YCB's banana, PartNet-Mobility's cabinets and faucets.
 
-What a hand needs to know of them is measured on their meshes. PartNet-Mobility's objects face -x, as ours do.
+The geometry that experts need is measured on their meshes. PartNet-Mobility's objects face -x, as ours do.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ PARTNET_FOLDER = ASSET_DIR / "partnet_mobility" / "dataset"
 URDF_NAMES = ("mobility_cvx.urdf", "mobility_fixed.urdf")
 TABLETOP_SCALE = 0.2  # PartNet-Mobility's objects fill the unit sphere; on the table they measure 0.4 m across
 
-UPRIGHT = 0.9  # least cosine between an axis and the direction wanted
-DAMPING, FRICTION = 0.08, 0.05  # of levers and doors; drawers are given DRAWER_DAMPING
+UPRIGHT = 0.9  # smallest cosine between an axis and the required direction
+DAMPING, FRICTION = 0.08, 0.05  # of levers and doors; drawers have DRAWER_DAMPING
 DRAWER_DAMPING = 15.0
 
 MIN_TRAVEL_M = 0.04
-MAX_HANDLE_M = STROKE_M - 0.014  # width of what the fingers straddle, with room on both sides
+MAX_HANDLE_M = STROKE_M - 0.014  # largest width between the open fingers, with clearance on both sides
 MIN_HANDLE_DEPTH_M = 0.010
-MAX_OVER_HANDLE_M = 0.045  # the hand's body passes above what rises higher over a handle
+MAX_OVER_HANDLE_M = 0.045  # largest height above a handle that clears the gripper's body
 MIN_DOOR_M = 0.08
 MIN_LEVER_M = 0.035
-LEVER_ROOT_SHARE = 0.5  # of a lever's length, that is hidden in its hub
+LEVER_ROOT_SHARE = 0.5  # share of a lever's length inside its hub
 
 Geometry = TypeVar("Geometry", Drawer, Door, Lever)
 
 
 class MissingAssetsError(RipError):
-    """ManiSkill's downloadable assets are not there, or none of them suits."""
+    """ManiSkill's downloadable assets are missing, or none is suitable."""
 
     def __init__(self, what: str, where: Path, download: str):
         super().__init__(
@@ -85,7 +85,7 @@ class _Model:
 
     @property
     def origin(self) -> FloatArray:
-        """The root in a frame on the table under the middle of the front."""
+        """Pose of the root in a frame on the table under the middle of the front."""
         (low_x, low_y, low_z), (_, high_y, _) = self.body
         return make_pose(np.eye(3), (-low_x, -(low_y + high_y) / 2, -low_z))
 
@@ -107,10 +107,10 @@ def _load(
     rng: np.random.Generator,
     measure: Callable[[_Model, Any], Geometry | None],
 ) -> tuple[Mechanism, Geometry]:
-    """The first model, in the order of ``rng``, with a joint that ``measure`` finds the hand can work."""
+    """The first model, in the order of ``rng``, with a joint that ``measure`` accepts."""
     info = json.loads((PACKAGE_ASSET_DIR / "partnet_mobility" / "meta" / f"info_{category}_train.json").read_text())
     installed = sorted(model for model in info if _urdf(model) is not None)
-    if objects is not None:  # every other model is one that demonstrations never show
+    if objects is not None:  # every other model is unseen
         installed = installed[objects == "unseen" :: 2]
     for model_id in rng.permutation(installed):
         scale = info[model_id]["scale"] if category == "faucet" else TABLETOP_SCALE
@@ -122,7 +122,7 @@ def _load(
                 resist(model.articulation, joint.name, damping, FRICTION)
                 return Mechanism(model.articulation, joint.name, joint.child_link.name, model.origin), geometry
         scene.remove_articulation(model.articulation)
-    raise MissingAssetsError(f"model of {category} that the hand can work", PARTNET_FOLDER, download)
+    raise MissingAssetsError(f"model of {category} that the gripper can operate", PARTNET_FOLDER, download)
 
 
 def _urdf(model_id: str) -> Path | None:
@@ -177,7 +177,7 @@ def _measure_door(model: _Model, joint: Any) -> Door | None:
     panel = model.points(joint.child_link, handle=False)
     if not joint.type[0].startswith("revolute") or abs(axis[2]) < UPRIGHT or not len(panel):
         return None
-    side = 1.0 if axis[2] < 0 else -1.0  # turning this way about the hinge on that side opens towards -x
+    side = 1.0 if axis[2] < 0 else -1.0  # this direction of rotation about the hinge opens towards -x
     low, high = panel.min(axis=0), panel.max(axis=0)
     width = float(point[1] - low[1] if side > 0 else high[1] - point[1])
     opens = float(joint.limits[0, 1] - joint.limits[0, 0])

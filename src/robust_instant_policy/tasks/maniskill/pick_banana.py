@@ -34,7 +34,7 @@ LIFTED_M = 0.05
 
 PICK = Pick(above=0.12, grasp=0.007, lift=0.16, reach_speed=0.35, down_speed=0.14, lift_speed=0.16, error=0.005)
 
-_skin = lru_cache(maxsize=4)(Banana.skin)  # a scene is built anew for each execution in it
+_skin = lru_cache(maxsize=4)(Banana.skin)  # each execution builds the scene again
 
 
 @register_env("RIP-PickBanana-v1", max_episode_steps=600)
@@ -42,7 +42,7 @@ class PickBananaEnv(CellEnv):
     """Success: the banana is off the table between both fingers, and the arm is still."""
 
     banana: Actor
-    lie: FloatArray  # the frame of `Banana` in the actor's own
+    lie: FloatArray  # the frame of `Banana` in the actor's frame
     rest_height: float  # of the banana's middle over the table
 
     def _load_scene(self, options: dict) -> None:

@@ -21,10 +21,10 @@ GOAL_DISTANCE_M = 0.1 + GOAL_RADIUS_M  # from the cube, along +x
 HEIGHT_TOLERANCE_M = 5e-3
 
 FINGER_HALF_WIDTH_M = 0.011
-APPROACH_M = 0.05  # between fingers and cube when the hand comes down behind it
-CLEARANCE_M = 0.1  # height at which the hand travels
+APPROACH_M = 0.05  # between fingers and cube while the gripper descends
+CLEARANCE_M = 0.1  # travel height of the gripper
 PUSH_HEIGHT_M = 0.015
-OVERSHOOT_M = 0.02  # a person stops within ± this of the middle of the goal
+OVERSHOOT_M = 0.02  # the demonstrator stops within ± this of the middle of the goal
 
 
 @register_env("RIP-PushCube-v1", max_episode_steps=600)
@@ -69,7 +69,7 @@ class PushCubeEnv(CellEnv):
 
 
 def push(env: PushCubeEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Close the hand, come down behind the cube, push it along +x into the goal, and back off."""
+    """Close the gripper, descend behind the cube, push it along +x into the goal, and retreat."""
     x, y, _ = env.cube.pose.p[0].tolist()
     behind = x - CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M - APPROACH_M
     end = x + GOAL_DISTANCE_M - CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)

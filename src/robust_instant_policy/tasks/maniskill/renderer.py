@@ -1,4 +1,4 @@
-"""Whether SAPIEN can render here. ``python -m`` this module to try it in a process of its own."""
+"""Test whether SAPIEN can render. ``python -m`` this module tests it in a separate process."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sapien.render
 
 from robust_instant_policy.errors import RendererError
 
-RENDER_DEVICE = "cpu"  # a Vulkan driver that runs on the processor, so that every machine gives the same image
+RENDER_DEVICE = "cpu"  # the CPU Vulkan driver, so that every machine renders the same image
 
 
 def require_renderer() -> str:

@@ -1,7 +1,7 @@
 """The UR5e with a Robotiq Hand-E as a ManiSkill agent.
 
-Published figures and their sources stand in ``ur5e_hande.urdf``. The drives are stiff, like the position
-controller of the real arm: they lag the command by about `DRIVE_LAG_S` and give way at the joints' torque limits.
+``ur5e_hande.urdf`` cites the sources of all published values. The drives are stiff, like the position
+controller of the real arm: they lag the command by about `DRIVE_LAG_S` and saturate at the joints' torque limits.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ GRIP_FORCE_N = 130.0  # (Hand-E manual)
 ARM_TORQUE_NM = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # "Max. joint torques", Universal Robots
 DRIVE_LAG_S = 0.03
 ARM_STIFFNESS = (6e3, 6e3, 4e3, 6e2, 6e2, 4e2)  # N m / rad: 5 mm into the table press with 70 to 210 N
-FINGER_STIFFNESS = 3e3  # N / m: soft enough never to saturate, so the two fingers stay centred as if geared together
+FINGER_STIFFNESS = 3e3  # N / m: low enough not to saturate, so the two fingers stay centred as with a gear
 FINGER_DAMPING = 1.5e2  # N s / m
 FINGER_FRICTION = 1.2  # rubber pads on plastic or wood
 
-PALM_TRIANGLE = GripperTriangle(length=TOOL_LENGTH_M, opening=STROKE_M)
+GRIPPER_TRIANGLE = GripperTriangle(length=TOOL_LENGTH_M, opening=STROKE_M)
 
 
 @register_agent()
@@ -100,7 +100,7 @@ class UR5eHandE(BaseAgent):
         )
 
     def _load_articulation(self, initial_pose: sapien.Pose | None = None) -> None:
-        # As the base class does, but the description is read once in a process, not once for each scene.
+        # As in the base class, but the description is read once per process, not per scene.
         builder = UR5eHandE._description = UR5eHandE._description or self._described()
         builder.set_scene(self.scene)
         builder.set_scene_idxs(None)
@@ -109,7 +109,7 @@ class UR5eHandE(BaseAgent):
         self.robot_link_names = [link.name for link in self.robot.get_links()]
 
     def _described(self) -> ArticulationBuilder:
-        """What the URDF file says, ready to be built in any scene."""
+        """The URDF file as a builder for any scene."""
         loader = self.scene.create_urdf_loader()
         loader.name, loader.disable_self_collisions = self.uid, self.disable_self_collisions
         sapien_utils.apply_urdf_config(loader, sapien_utils.parse_urdf_config(self.urdf_config))
@@ -127,7 +127,7 @@ class UR5eHandE(BaseAgent):
     def drive(self, command: FloatArray) -> None:
         """Command joint angles and finger travel ``(7,)``, as the control mode ``pd_joint_pos`` does in one scene.
 
-        A controller's own way there takes longer than the physics.
+        The controller's own method takes longer than the physics.
         """
         if not np.isfinite(command).all():
             raise InvalidValueError(f"joints cannot be commanded to {command}")

@@ -1,4 +1,4 @@
-"""The five tasks of the ManiSkill cell, behind the contract of `tasks.task.Task`."""
+"""The five tasks of the ManiSkill cell as `tasks.task.Task`."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class CellTask(SimulatedTask):
         require_renderer()
         env = gymnasium.make(spec.env_id, obs_mode="none", reward_mode="none", objects=objects, assets=assets)
         super().__init__(spec, env.unwrapped, [ur5e_hande()], TIMING, WORKSPACE)
-        # The simulator searches the whole process for garbage whenever it rebuilds a scene. What lives by now (torch
-        # and its like) lives on; sparing it makes a reset several times faster.
+        # The simulator runs the garbage collector whenever it rebuilds a scene. Excluding the objects that exist now
+        # (torch and other libraries) makes a reset several times faster.
         gc.collect()
         gc.freeze()
 

@@ -26,7 +26,7 @@ PUSH_SHARE = 0.75  # of the lever's length, from its axis
 APPROACH_M = 0.035
 FINGERS_BELOW_M = 0.02  # fingertips under the lever's middle
 ABOVE_M = 0.07
-PUSH_FURTHER_RAD = 0.04  # a person turns until it stops
+PUSH_FURTHER_RAD = 0.04  # the demonstrator turns to the stop
 ARC_POINTS = 7
 
 
@@ -62,7 +62,7 @@ class TurnFaucetEnv(CellEnv):
 
 
 def turn(env: TurnFaucetEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Close the hand, come down behind the lever, and push it round to its stop."""
+    """Close the gripper, descend behind the lever, and push it to its stop."""
     lever, height = env.lever, env.lever.height - FINGERS_BELOW_M
     radius = lever.length * PUSH_SHARE * rng.uniform(0.95, 1.05)
 

@@ -1,4 +1,4 @@
-"""What experts say about the hand."""
+"""Tool poses for the experts of the ALOHA tasks."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from robust_instant_policy.tasks.poses import pitched
 
 
 def grip(point: FloatArray, pitch: float, yaw: float, beyond: float) -> FloatArray:
-    """Tool pose ``(4, 4)`` of a hand, turned as in `pitched`, whose fingertips reach ``beyond`` metres past a point."""
-    hand = pitched(pitch, yaw)
-    return make_pose(hand, point + beyond * hand[:, 2])
+    """Tool pose ``(4, 4)`` with the rotation of `pitched`, its fingertips ``beyond`` metres past a point."""
+    rotation = pitched(pitch, yaw)
+    return make_pose(rotation, point + beyond * rotation[:, 2])
 
 
 def back(pose: FloatArray, distance: float) -> FloatArray:
-    """``pose`` drawn back along its approach, in metres."""
+    """``pose`` moved back along its approach, in metres."""
     return make_pose(pose[:3, :3], pose[:3, 3] - distance * pose[:3, 2])
 
 
@@ -26,9 +26,9 @@ def over(point: FloatArray, height: float) -> FloatArray:
 
 
 def bearing(point: FloatArray) -> float:
-    """Direction, in rad, in which the working arm sees ``point (3,)``.
+    """Direction, in rad, from the working arm's base to ``point (3,)``.
 
-    A hand that points that way is in line with its forearm and turns up without effort; at an angle to it, the
-    forearm would have to roll over.
+    A gripper in this direction is in line with its forearm and pitches up with one joint; in other directions the
+    forearm would have to roll.
     """
     return float(np.arctan2(point[1], point[0] + BASE_X_M))
