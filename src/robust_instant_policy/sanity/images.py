@@ -14,6 +14,7 @@ from robust_instant_policy.sanity.contact import Path, gaps
 from robust_instant_policy.sanity.envelope import approaches
 from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.geometry import (
+    BURIED_M,
     CONSISTENT,
     MIN_SHARE,
     TOUCH_M,
@@ -122,6 +123,9 @@ def _measured(today: Evidence) -> str:
         return f"fingertips reach {-today.lowest * 1e3:.0f} mm below the table that the images show"
     if today.clear < MIN_SHARE:
         buried = float(np.median([c.buried for c in today.contacts]))
+        if buried < BURIED_M:
+            lowest = float(np.median([min(c.lowest, c.lowest_palm) for c in today.contacts]))
+            return f"the gripper reaches {-lowest * 1e3:.0f} mm below the table that the images show"
         return f"the palm passes {buried * 1e3:.0f} mm deep through what the images show"
     if today.touching < MIN_SHARE:
         if np.isfinite(today.grasp_gap) and today.grasp_gap > TOUCH_M:
