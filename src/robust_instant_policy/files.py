@@ -22,6 +22,7 @@ KINDS = {
     stat.S_IFSOCK: "a socket",
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
+    stat.S_IFLNK: "a symbolic link",
 }
 PART_SUFFIX = ".part"  # of hidden files under way; what still bears it was left by a killed process
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -41,6 +42,12 @@ def open_regular(path: str | Path) -> BinaryIO:
         file.close()
         raise
     return file
+
+
+def read_regular(path: str | Path) -> bytes:
+    """The content of a regular file; raises as `open_regular` does."""
+    with open_regular(path) as file:
+        return file.read()
 
 
 def read_json(path: str | Path, kind: str = "a JSON object") -> dict[str, Any]:
@@ -80,9 +87,11 @@ def excerpt(said: str | Path | Exception) -> str:
 def write_whole(path: Path, content: bytes) -> None:
     """Write ``path`` so that a crash leaves either its old content or all of the new one.
 
-    The content goes to a hidden neighbour, to the disk itself, and only then takes its name.
+    The content goes to a hidden neighbour, to the disk itself, and only then takes its name. That would put a file in
+    the place of a device, a pipe or a link, so only a regular file is replaced.
     Raises `DatasetError` when it cannot be written; the old content then still stands.
     """
+    require_replaceable(path)
     part = path.with_name(f".{path.name}.{os.getpid()}{PART_SUFFIX}")
     try:
         make_folder(path.parent)
@@ -96,6 +105,15 @@ def write_whole(path: Path, content: bytes) -> None:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
         raise write_error(path, error) from error
+
+
+def require_replaceable(path: Path) -> None:
+    """Raises `DatasetError` where ``path`` is there and is not a regular file."""
+    try:
+        mode = os.lstat(_checked_name(path)).st_mode
+    except OSError:  # nothing there, or the attempt to write will tell
+        return
+    _require_regular(path, mode)
 
 
 def make_folder(path: Path) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO
 
 from robust_instant_policy.errors import ModelError, UsageError
+from robust_instant_policy.files import open_regular
 from robust_instant_policy.llm.model import MAX_ROUNDS, NOBODY, LanguageModel, Listener, Sampling, estimate_tokens
 from robust_instant_policy.query import Answer, Query
 
@@ -61,6 +62,8 @@ class SampleStore:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists():
+            open_regular(self.path).close()  # SQLite would write a journal beside a device, and wait at a pipe
         try:
             self._db = sqlite3.connect(self.path, timeout=BUSY_TIMEOUT_S, check_same_thread=False, isolation_level=None)
             tables = {name for (name,) in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
