@@ -31,11 +31,17 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 def open_regular(path: str | Path) -> BinaryIO:
     """Open a regular file for reading; every reader of a file from outside goes through here.
 
-    Opening a pipe or a device can block or have side effects, and their content has no end. Raises `DatasetError` for
-    one of these and for a folder, `OSError` as `open` does for a file that is missing or unreadable.
+    Opening a pipe or a device can block or have side effects, and their content has no end. Raises
+    `FileNotFoundError` for a file that is missing, `DatasetError` for one of these, a folder, and a file that may not
+    be read: its content may be sound.
     """
-    _require_regular(path, os.stat(_checked_name(path)).st_mode)
-    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    try:
+        _require_regular(path, os.stat(_checked_name(path)).st_mode)
+        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror or error}") from None
     try:
         _require_regular(path, os.fstat(file.fileno()).st_mode)  # the one opened: the name may have been replaced
     except DatasetError:
