@@ -556,3 +556,14 @@ def test_rows_whose_names_lead_to_other_folders_are_refused(tmp_path, capsys):
     assert main(["merge", str(tmp_path / "run"), "--out", str(tmp_path / "all")]) == 1
     assert "another folder" in capsys.readouterr().err
     assert not (tmp_path / "all").exists()
+
+
+@pytest.mark.parametrize("command", ["eval", "merge"])
+def test_results_are_not_written_among_demonstrations(workbench, tmp_path, capsys, command):
+    demonstrations = workbench / "data" / "push-cube"
+    before = sorted(demonstrations.rglob("*"))
+    keep(tmp_path / "run", episode(RIP, 0, True))
+    words = [str(tmp_path / "run")] if command == "merge" else []
+    assert main([command, *words, "--out", str(demonstrations)]) == 1
+    assert "holds demonstrations" in capsys.readouterr().err
+    assert sorted(demonstrations.rglob("*")) == before

@@ -112,9 +112,7 @@ def require_no_path(*names: str) -> None:
     from elsewhere holds, and must stay inside of the folder that they are written to."""
     for name in names:
         if not isinstance(name, str) or "/" in name or "\0" in name:
-            raise InvalidValueError(
-                f"{name!r} leads to another folder; names of tasks, suites and objects do not"
-            )
+            raise InvalidValueError(f"{name!r} leads to another folder; names of tasks, suites and objects do not")
 
 
 @dataclass(frozen=True)
