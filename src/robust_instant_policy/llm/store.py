@@ -8,12 +8,13 @@ import hashlib
 import json
 import sqlite3
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
-from robust_instant_policy.errors import ModelError, UsageError
+from robust_instant_policy.errors import DatasetError, ModelError, UsageError
 from robust_instant_policy.files import open_regular
 from robust_instant_policy.llm.model import MAX_ROUNDS, NOBODY, LanguageModel, Listener, Sampling, estimate_tokens
 from robust_instant_policy.query import Answer, Query
@@ -127,7 +128,7 @@ class SampleStore:
         key = (model, digest, settings, sample)
         where = "WHERE model = ? AND query = ? AND settings = ? AND sample = ?"
         asked = (query.text, query.instruction, query.grammar, query.pattern, json.dumps(query.stop), query.max_tokens)
-        with self._lock:
+        with self._locked():
             self._db.execute("BEGIN IMMEDIATE")
             try:
                 self._db.execute("INSERT OR IGNORE INTO queries VALUES (?, ?, ?, ?, ?, ?, ?)", (digest, *asked))
@@ -140,10 +141,10 @@ class SampleStore:
                 self._db.execute(
                     "INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", (*key, attempt, text, *cost)
                 )
-            except BaseException:
-                self._db.execute("ROLLBACK")
-                raise
-            self._db.execute("COMMIT")
+                self._db.execute("COMMIT")
+            finally:
+                if self._db.in_transaction:
+                    self._db.execute("ROLLBACK")
 
     def take(self, other: str | Path) -> int:
         """Copy what only the store at ``other`` holds, all of it or nothing; returns the number of answers copied.
@@ -185,7 +186,7 @@ class SampleStore:
     def write_failure(self, model: str, queries: Sequence[Query], sampling: Sampling, message: str) -> None:
         """Keep the message with which a model failed; a replay fails with the same."""
         row = (model, _request_digest(queries, sampling), message)
-        with self._lock:
+        with self._locked():
             self._db.execute("INSERT OR REPLACE INTO failures VALUES (?, ?, ?)", row)
 
     def read_failure(self, model: str, queries: Sequence[Query], sampling: Sampling) -> str | None:
@@ -196,8 +197,19 @@ class SampleStore:
         return rows[0][0] if rows else None
 
     def _select(self, sql: str, values: Sequence[object] = ()) -> list[tuple]:
-        with self._lock:
+        with self._locked():
             return self._db.execute(sql, values).fetchall()
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Use the database alone; its errors become one line."""
+        try:
+            with self._lock:
+                yield
+        except sqlite3.DatabaseError as error:
+            raise DatasetError(
+                f"cannot use {self.path}: {error}; what it holds is kept: free space on the disk, or give another file"
+            ) from None
 
 
 class RecordedModel:
