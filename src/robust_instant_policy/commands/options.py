@@ -58,4 +58,4 @@ def method_settings(options: argparse.Namespace) -> dict[str, Any]:
 def beside(folder: Path, ending: str) -> Path:
     """The path of a page named like ``folder``, next to it."""
     named = folder if folder.name and folder.name != ".." else folder.resolve()
-    return named.with_name(named.name + ending)
+    return named.parent / (named.name + ending)  # "/" has no name
