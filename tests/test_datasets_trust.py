@@ -221,3 +221,11 @@ def test_a_recording_that_leads_into_other_files_is_refused(tmp_path):
         del file[name]
         file.create_dataset(name, (10**6, 10**6), "f8", chunks=True)
     assert "GiB" in refusal(import_demonstrations, path, "lift", rig)
+
+
+def test_a_file_that_cannot_be_opened_is_told_as_such_and_not_as_damaged(tmp_path):
+    loop = tmp_path / "loop.npz"
+    loop.symlink_to(loop)  # also root, who may read everything, cannot open it
+    told = refusal(Observation.load, loop)
+    assert "cannot read" in told
+    assert "not an .npz" not in told

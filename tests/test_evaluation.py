@@ -10,7 +10,7 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import asdict, replace
 from fractions import Fraction
 
 import pyarrow.parquet as pq
@@ -524,3 +524,47 @@ def test_what_a_dead_worker_had_finished_is_not_handed_out_again():
 def test_a_training_budget_is_part_of_what_was_trained_and_of_nothing_else():
     suite = make_suites(["table1"], Choice(RIP, tasks=["push-cube"], methods=["rip", "kat-dp"], steps=70))[0]
     assert [variant.steps for variant in suite.variants] == [None, 70]
+
+
+@pytest.mark.parametrize("name", ["results.sqlite", "episodes.parquet", "run.json"])
+def test_a_pipe_in_the_place_of_a_result_file_is_told_and_not_waited_for(tmp_path, capsys, name):
+    an_export(tmp_path, episode(RIP, 1, True))
+    (tmp_path / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / name)
+    assert main(["report", str(tmp_path)]) == 1
+    assert "named pipe" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("field", ["name", "objects", "assets"])
+def test_a_run_from_elsewhere_writes_nothing_outside_of_its_folder(tmp_path, capsys, field):
+    folder = tmp_path / "run"
+    suite = make_suites(["table1"], Choice(RIP))[0]
+    an_export(folder, episode(suite.variants[0], suite.seeds[0], True))
+    content = json.loads((folder / "run.json").read_text())
+    content["suites"] = [json.loads(json.dumps(asdict(suite))) | {field: "../outside"}]
+    (folder / "run.json").write_text(json.dumps(content))
+    assert main(["report", str(folder)]) == 1
+    assert "another folder" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_rows_whose_names_lead_to_other_folders_are_refused(tmp_path, capsys):
+    an_export(tmp_path / "run", episode(RIP, 1, False))
+    table = pq.read_table(tmp_path / "run" / "episodes.parquet")
+    column = table.schema.get_field_index("task")
+    table = table.set_column(column, "task", [["../../../etc/cron"]])
+    pq.write_table(table, tmp_path / "run" / "episodes.parquet")
+    assert main(["merge", str(tmp_path / "run"), "--out", str(tmp_path / "all")]) == 1
+    assert "another folder" in capsys.readouterr().err
+    assert not (tmp_path / "all").exists()
+
+
+@pytest.mark.parametrize("command", ["eval", "merge"])
+def test_results_are_not_written_among_demonstrations(workbench, tmp_path, capsys, command):
+    demonstrations = workbench / "data" / "push-cube"
+    before = sorted(demonstrations.rglob("*"))
+    keep(tmp_path / "run", episode(RIP, 0, True))
+    words = [str(tmp_path / "run")] if command == "merge" else []
+    assert main([command, *words, "--out", str(demonstrations)]) == 1
+    assert "holds demonstrations" in capsys.readouterr().err
+    assert sorted(demonstrations.rglob("*")) == before

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from robust_instant_policy.cli import main
 from robust_instant_policy.errors import ModelError, UsageError
 from robust_instant_policy.llm import Listener, RecordedModel, ReplayedModel, SampleStore, Sampling, connect
 from robust_instant_policy.llm.model import NOBODY, Tally
@@ -258,6 +259,21 @@ def test_a_file_that_is_no_store_is_refused_in_one_line(tmp_path):
     with pytest.raises(UsageError, match="is not a sample store"):
         SampleStore(path)
     assert path.read_text().startswith("these are my notes")
+
+
+def test_a_store_with_tables_of_another_kind_or_damaged_pages_is_told_in_one_line(tmp_path, capsys):
+    with sqlite3.connect(tmp_path / "other.sqlite") as other:
+        other.execute("CREATE TABLE answers (x)")
+    assert main(["samples", str(tmp_path / "other.sqlite")]) == 1
+    store = SampleStore(tmp_path / "damaged.sqlite")
+    store.write("a model", QUERIES[0], "{}", 0, 0, Answer("1 2 3"))
+    store.close()
+    content = (tmp_path / "damaged.sqlite").read_bytes()
+    (tmp_path / "damaged.sqlite").write_bytes(content[:4096] + b"\xff" * (len(content) - 4096))
+    assert main(["samples", str(tmp_path / "damaged.sqlite")]) in (1, 2)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert not any("unexpected" in line for line in lines)
 
 
 def _write_for_ever(path: Path, name: str) -> None:

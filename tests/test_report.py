@@ -1,4 +1,5 @@
 import json
+import os
 import re
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from robust_instant_policy.reporting.run import (
     CONTEXT_FILE,
     PLAN_FILE,
     SEEN_FILE,
+    VIDEO_FILE,
     RunRecord,
     save_context,
     write_report,
@@ -247,3 +249,24 @@ def test_a_file_that_is_no_observation_is_refused_in_one_line(tmp_path):
     for name in ("text.npz", "half.npz", "objects.npz", "absent.npz"):
         with pytest.raises(DatasetError, match=name):
             Observation.load(tmp_path / name)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link", "folder"])
+@pytest.mark.parametrize("name", [PLAN_FILE, SEEN_FILE, "report.html"])
+def test_what_is_no_regular_file_is_neither_replaced_nor_waited_for(run_folder, tmp_path, capsys, name, kind):
+    path, target = run_folder / name, tmp_path / "elsewhere"
+    target.write_text("mine")
+    path.unlink(missing_ok=True)
+    {"pipe": os.mkfifo, "link": lambda it: it.symlink_to(target), "folder": os.mkdir}[kind](path)
+    before = path.lstat().st_mode
+    assert main(["report", str(run_folder)]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    assert (path.lstat().st_mode, target.read_text()) == (before, "mine")
+
+
+@pytest.mark.parametrize("name", ["run.json", CONTEXT_FILE, VIDEO_FILE])
+def test_a_pipe_in_the_place_of_a_run_s_file_is_told(run_folder, capsys, name):
+    (run_folder / name).unlink(missing_ok=True)
+    os.mkfifo(run_folder / name)
+    assert main(["report", str(run_folder)]) == 1
+    assert "named pipe" in capsys.readouterr().err

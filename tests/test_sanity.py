@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.faults import FAULTS, points
+from benchmarks.faults import FAULTS, points, states
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.cli import main
@@ -152,6 +152,13 @@ def test_another_camera_is_no_error_where_its_calibration_is_right(report, scene
 def test_demonstrations_that_do_not_belong_together_are_refused(demonstrations, fault, words):
     with pytest.raises((DemonstrationError, GeometryError), match=words):
         check_demonstrations(FAULTS[fault].demonstrations(demonstrations)).raise_if_wrong()
+
+
+def test_grippers_that_never_close_are_doubted(demonstrations):
+    held_open = states(lambda state: state * 0)(demonstrations)
+    told = [str(finding) for finding in check_demonstrations(held_open).findings]
+    assert any("no gripper opens or closes" in line for line in told)
+    assert not any("no gripper opens" in str(finding) for finding in check_demonstrations(demonstrations).findings)
 
 
 def test_demonstrations_of_one_scene_say_that_others_lie_outside(demonstrations, scene):

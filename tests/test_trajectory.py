@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robust_instant_policy import Trajectory
+from robust_instant_policy import Observation, Trajectory
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import GripperTriangle, fit_rigid, lift, make_pose, project
 from robust_instant_policy.trajectory import STATE_INDEX, downsample, masked_steps, uniform_steps
@@ -139,3 +139,11 @@ def test_a_trajectory_cannot_be_changed_by_accident():
     trajectory = grasping(3, [])
     with pytest.raises(ValueError, match="read-only"):
         trajectory.actions[0, 0] = 1.0
+
+
+@pytest.mark.parametrize("focal", [1e-300, 0.1, 1e6, 1e300])
+def test_focal_lengths_that_are_not_in_pixels_are_refused_in_a_short_line(focal):
+    intrinsics = np.array([[focal, 0, 32], [0, 90, 32], [0, 0, 1]])
+    with pytest.raises(InvalidValueError, match="must be in pixels") as told:
+        Observation(np.zeros((64, 64, 3), np.uint8), np.ones((64, 64)), intrinsics, np.eye(4))
+    assert len(str(told.value)) < 200

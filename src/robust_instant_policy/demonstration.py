@@ -23,6 +23,7 @@ from robust_instant_policy.trajectory import Trajectory
 
 FARTHEST_CAMERA_M = 50.0  # from the origin of the world; farther, it is not in metres
 MAX_PIXELS = 2**25  # of an image; one of 7680 x 4320 has fewer
+FOCAL_LENGTHS = (0.01, 1000.0)  # times the larger edge of the image: fields of view of 179 and 0.06 degrees
 MAX_SKEW = 1e-3  # of the focal length; pixels of real cameras are rectangular
 MAX_ARRAY_BYTES = 8 * MAX_PIXELS  # depth in float64
 ARRAYS = ("rgb", "depth", "intrinsics", "camera_pose")  # of an observation file
@@ -103,6 +104,12 @@ def _check_intrinsics(intrinsics: FloatArray, height: int, width: int) -> None:
         raise InvalidValueError("the last row of intrinsics (3, 3) must be 0 0 1; is it transposed?")
     if fx <= 0 or fy <= 0:
         raise InvalidValueError(f"the focal lengths of intrinsics (3, 3) must be positive, got fx {fx:g}, fy {fy:g}")
+    shortest, longest = (factor * max(height, width) for factor in FOCAL_LENGTHS)
+    if not (shortest <= min(fx, fy) and max(fx, fy) <= longest):
+        raise InvalidValueError(
+            f"the focal lengths of intrinsics (3, 3) must be in pixels, from {shortest:g} to {longest:g} for {width} x "
+            f"{height}, got fx {fx:g}, fy {fy:g}"
+        )
     if max(abs(skew), abs(other_skew)) > MAX_SKEW * min(fx, fy):
         raise InvalidValueError(f"intrinsics (3, 3) have a skew of {skew or other_skew:g}; rectify the image first")
     if not (-width <= cx <= 2 * width and -height <= cy <= 2 * height):

@@ -22,6 +22,7 @@ KINDS = {
     stat.S_IFSOCK: "a socket",
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
+    stat.S_IFLNK: "a symbolic link",
 }
 PART_SUFFIX = ".part"  # of hidden files under way; what still bears it was left by a killed process
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -30,17 +31,29 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 def open_regular(path: str | Path) -> BinaryIO:
     """Open a regular file for reading; every reader of a file from outside goes through here.
 
-    Opening a pipe or a device can block or have side effects, and their content has no end. Raises `DatasetError` for
-    one of these and for a folder, `OSError` as `open` does for a file that is missing or unreadable.
+    Opening a pipe or a device can block or have side effects, and their content has no end. Raises
+    `FileNotFoundError` for a file that is missing, `DatasetError` for one of these, a folder, and a file that may not
+    be read: its content may be sound.
     """
-    _require_regular(path, os.stat(_checked_name(path)).st_mode)
-    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    try:
+        _require_regular(path, os.stat(_checked_name(path)).st_mode)
+        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror or error}") from None
     try:
         _require_regular(path, os.fstat(file.fileno()).st_mode)  # the one opened: the name may have been replaced
     except DatasetError:
         file.close()
         raise
     return file
+
+
+def read_regular(path: str | Path) -> bytes:
+    """The content of a regular file; raises as `open_regular` does."""
+    with open_regular(path) as file:
+        return file.read()
 
 
 def read_json(path: str | Path, kind: str = "a JSON object") -> dict[str, Any]:
@@ -80,9 +93,11 @@ def excerpt(said: str | Path | Exception) -> str:
 def write_whole(path: Path, content: bytes) -> None:
     """Write ``path`` so that a crash leaves either its old content or all of the new one.
 
-    The content goes to a hidden neighbour, to the disk itself, and only then takes its name.
+    The content goes to a hidden neighbour, to the disk itself, and only then takes its name. That would put a file in
+    the place of a device, a pipe or a link, so only a regular file is replaced.
     Raises `DatasetError` when it cannot be written; the old content then still stands.
     """
+    require_replaceable(path)
     part = path.with_name(f".{path.name}.{os.getpid()}{PART_SUFFIX}")
     try:
         make_folder(path.parent)
@@ -96,6 +111,15 @@ def write_whole(path: Path, content: bytes) -> None:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
         raise write_error(path, error) from error
+
+
+def require_replaceable(path: Path) -> None:
+    """Raises `DatasetError` where ``path`` is there and is not a regular file."""
+    try:
+        mode = os.lstat(_checked_name(path)).st_mode
+    except OSError:  # nothing there, or the attempt to write will tell
+        return
+    _require_regular(path, mode)
 
 
 def make_folder(path: Path) -> None:

@@ -12,6 +12,7 @@ from robust_instant_policy.commands.options import beside, positive, seed
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.evaluation import scene_seed
+from robust_instant_policy.files import write_whole
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.perception.accuracy import Accuracy, measure
 from robust_instant_policy.reporting.keypoints import keypoints_page
@@ -67,7 +68,7 @@ def show_keypoints(demos: Path, features: str, num_scenes: int, noisy: bool, see
         screen.say("    no errors: the true positions are known for simulated tasks only")
     for note in extractor.notes_:
         screen.say(f"    {note}")
-    out.write_text(keypoints_page(extractor, images, scenes, accuracy, f"Keypoints of {name}"), encoding="utf-8")
+    write_whole(out, keypoints_page(extractor, images, scenes, accuracy, f"Keypoints of {name}").encode())
     screen.say(f"page: {out}")
     return out
 

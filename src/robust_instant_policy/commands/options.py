@@ -80,4 +80,4 @@ def method_settings(options: argparse.Namespace) -> dict[str, Any]:
 def beside(folder: Path, ending: str) -> Path:
     """Path of a page beside ``folder``, with its name."""
     named = folder if folder.name and folder.name != ".." else folder.resolve()
-    return named.with_name(named.name + ending)
+    return named.parent / (named.name + ending)  # "/" has no name

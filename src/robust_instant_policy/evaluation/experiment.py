@@ -11,7 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from robust_instant_policy.datasets import layout
 from robust_instant_policy.demonstration import Demonstration
+from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey, Trial
 from robust_instant_policy.evaluation.failures import Failure, video_file
 from robust_instant_policy.evaluation.manifest import code_digest
@@ -118,7 +120,10 @@ def run_suites(
 
 @contextmanager
 def one_writer(out: Path) -> Iterator[None]:
-    """Keep other processes from writing into the run's folder ``out``; `DatasetError` when one does."""
+    """Keep other processes from writing into the run's folder ``out``; `DatasetError` when one does, and for a folder
+    of demonstrations."""
+    if (out / layout.RIP_PATH).exists() or (out / layout.INFO_PATH).exists():
+        raise DatasetError(f"{out} holds demonstrations; give a folder of its own for the results")
     descriptor = lock_folder(out)
     try:
         yield

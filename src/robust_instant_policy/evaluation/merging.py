@@ -12,7 +12,7 @@ from robust_instant_policy.evaluation.experiment import PLAN_FOLDER, TRAINING_FO
 from robust_instant_policy.evaluation.failures import video_file
 from robust_instant_policy.evaluation.store import Results, ResultsStore, read_results
 from robust_instant_policy.evaluation.work import STORE_FILE
-from robust_instant_policy.files import finished_files, make_folder, write_whole
+from robust_instant_policy.files import finished_files, make_folder, read_regular, write_whole
 from robust_instant_policy.llm import SampleStore
 
 
@@ -45,7 +45,7 @@ def merge(folders: Sequence[Path], out: Path, report: Callable[[Share], None] = 
             own = {row.key for row in run.episodes if known.get(row.key, row) == row}
             for name in (*_pictures(folder), *(video_file(*key) for key in own)):
                 if (folder / name).exists() and not (out / name).exists():
-                    write_whole(out / name, (folder / name).read_bytes())
+                    write_whole(out / name, read_regular(folder / name))
             if (folder / STORE_FILE).exists():
                 with closing(SampleStore(out / STORE_FILE)) as samples:
                     samples.take(folder / STORE_FILE)

@@ -29,7 +29,7 @@ from robust_instant_policy.evaluation.failures import Failure
 from robust_instant_policy.evaluation.manifest import MANIFEST_FILE, Invocation, Manifest, code_version, machine
 from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.variant import Scene, Variant
-from robust_instant_policy.files import make_folder, write_whole
+from robust_instant_policy.files import make_folder, open_regular, read_regular, write_whole
 
 RESULTS_FILE = "results.sqlite"
 EPISODES_FILE, FAILURES_FILE = "episodes.parquet", "failures.parquet"
@@ -220,7 +220,7 @@ class _Table:
         if not path.exists():
             return
         try:
-            table = pq.read_table(pa.BufferReader(path.read_bytes()))  # any name, whatever the locale
+            table = pq.read_table(pa.BufferReader(read_regular(path)))  # any name, whatever the locale
         except (pa.ArrowException, OSError) as error:
             raise DatasetError(f"{path} cannot be read ({error}); move it away to start again") from None
         self._check(set(table.schema.names), path)
@@ -308,6 +308,8 @@ def _write_exports(folder: Path, results: Results) -> None:
 
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
+    if path.exists():
+        open_regular(path).close()  # SQLite would wait at a pipe
     address = f"file:{quote(os.fsencode(path.absolute()))}?mode={mode}"
     database = sqlite3.connect(address, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
     database.execute("PRAGMA synchronous=FULL")

@@ -10,7 +10,7 @@ from typing import Any
 from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.evaluation.paper import TABLE1_TASKS
 from robust_instant_policy.evaluation.scenes import scene_seed
-from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.evaluation.variant import Scene, Variant, require_no_path
 from robust_instant_policy.policies import METHOD_NAMES
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.tasks import TASK_NAMES
@@ -40,6 +40,7 @@ class Suite:
     assets: str = "code"
 
     def __post_init__(self) -> None:
+        require_no_path(self.name, self.objects, self.assets)
         for kind, names, known in (
             ("task", self.tasks, TASK_NAMES),
             ("method", [variant.method for variant in self.variants], METHOD_NAMES),

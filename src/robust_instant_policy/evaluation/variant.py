@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
+from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.policies import ASKING_METHODS, REGRESSING_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.regression import DEFAULT_DOF
@@ -110,6 +111,14 @@ def by_demos(variants: Sequence[Variant]) -> dict[str, dict[int, Variant]]:
     return dict(zip(labels(list(groups)), groups.values(), strict=True))
 
 
+def require_no_path(*names: str) -> None:
+    """Raises `InvalidValueError` for one with a slash: files are named after ``names``, also those that a run's folder
+    from elsewhere holds, and must stay inside of the folder that they are written to."""
+    for name in names:
+        if not isinstance(name, str) or "/" in name or "\0" in name:
+            raise InvalidValueError(f"{name!r} leads to another folder; names of tasks, suites and objects do not")
+
+
 @dataclass(frozen=True)
 class Scene:
     """A drawn scene of ``task``, with ``objects`` that are "seen" in the demonstrations or "unseen".
@@ -121,6 +130,9 @@ class Scene:
     objects: str
     seed: int
     assets: str = "code"
+
+    def __post_init__(self) -> None:
+        require_no_path(self.task, self.objects, self.assets)
 
     def __str__(self) -> str:
         return f"{self.task}-{self.objects}-{self.seed}" + ("" if self.assets == "code" else f"-{self.assets}")

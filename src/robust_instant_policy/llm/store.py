@@ -8,12 +8,14 @@ import hashlib
 import json
 import sqlite3
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
-from robust_instant_policy.errors import ModelError, UsageError
+from robust_instant_policy.errors import DatasetError, ModelError, UsageError
+from robust_instant_policy.files import open_regular
 from robust_instant_policy.llm.model import MAX_ROUNDS, NOBODY, LanguageModel, Listener, Sampling, estimate_tokens
 from robust_instant_policy.query import Answer, Query
 
@@ -61,6 +63,8 @@ class SampleStore:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists():
+            open_regular(self.path).close()  # SQLite would write a journal beside a device, and wait at a pipe
         try:
             self._db = sqlite3.connect(self.path, timeout=BUSY_TIMEOUT_S, check_same_thread=False, isolation_level=None)
             tables = {name for (name,) in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
@@ -124,7 +128,7 @@ class SampleStore:
         key = (model, digest, settings, sample)
         where = "WHERE model = ? AND query = ? AND settings = ? AND sample = ?"
         asked = (query.text, query.instruction, query.grammar, query.pattern, json.dumps(query.stop), query.max_tokens)
-        with self._lock, self._db:  # commits, or takes back
+        with self._locked(), self._db:  # commits, or takes back
             self._db.execute("BEGIN IMMEDIATE")
             self._db.execute("INSERT OR IGNORE INTO queries VALUES (?, ?, ?, ?, ?, ?, ?)", (digest, *asked))
             taken = self._db.execute(f"SELECT text FROM answers {where} AND attempt = ?", (*key, attempt)).fetchone()
@@ -167,7 +171,7 @@ class SampleStore:
     def write_failure(self, model: str, queries: Sequence[Query], sampling: Sampling, message: str) -> None:
         """Keep the message with which a model failed; a replay fails with the same."""
         row = (model, _request_digest(queries, sampling), message)
-        with self._lock:
+        with self._locked():
             self._db.execute("INSERT OR REPLACE INTO failures VALUES (?, ?, ?)", row)
 
     def read_failure(self, model: str, queries: Sequence[Query], sampling: Sampling) -> str | None:
@@ -178,8 +182,19 @@ class SampleStore:
         return rows[0][0] if rows else None
 
     def _select(self, sql: str, values: Sequence[object] = ()) -> list[tuple]:
-        with self._lock:
+        with self._locked():
             return self._db.execute(sql, values).fetchall()
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Use the database alone; its errors become one line."""
+        try:
+            with self._lock:
+                yield
+        except sqlite3.DatabaseError as error:
+            raise DatasetError(
+                f"cannot use {self.path}: {error}; what it holds is kept: free space on the disk, or give another file"
+            ) from None
 
 
 class RecordedModel:

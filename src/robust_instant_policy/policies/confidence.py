@@ -18,7 +18,7 @@ import numpy as np
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity import Finding, errors
 
-COEFFICIENTS = {"constant": 4.9, "keypoints": 1.1, "prediction": 0.8, "novelty": 0.75, "warnings": 0.9}
+COEFFICIENTS = {"constant": 4.1, "keypoints": 0.93, "prediction": 0.53, "novelty": 0.85, "warnings": 0.66}
 UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
 
 UNKNOWN_NOTE = (

@@ -15,7 +15,7 @@ from robust_instant_policy.datasets.folder import open_folder, read_json
 from robust_instant_policy.datasets.reader import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import write_whole
+from robust_instant_policy.files import read_regular, write_whole
 from robust_instant_policy.reporting.pages import data_uri, png, render
 from robust_instant_policy.reporting.pictures import REFERENCE_WIDTH, Line, Picture, picture, svg_points, tool_points
 
@@ -88,7 +88,7 @@ def _videos(root: Path, count: int) -> list[str]:
         return [""] * count
     paths = [root / layout.episode_path(layout.VIDEO_PATTERN, episode) for episode in range(count)]
     try:
-        return [data_uri(path.read_bytes(), "video/mp4") for path in paths]
+        return [data_uri(read_regular(path), "video/mp4") for path in paths]
     except OSError as error:
         raise DatasetError(f"{error.filename} cannot be read: restore it, or record the folder again") from error
 

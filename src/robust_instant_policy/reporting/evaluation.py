@@ -8,6 +8,7 @@ from pathlib import Path
 
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import Failure, video_file
+from robust_instant_policy.files import read_regular
 from robust_instant_policy.reporting.pages import data_uri, render
 from robust_instant_policy.reporting.tables import Table
 
@@ -122,5 +123,5 @@ def _failed_episode(folder: Path, row: Episode, failure: Failure | None) -> Fail
         cause += f"; largest keypoint error {1000 * failure.keypoint_error:.0f} mm"
     objects = "" if row.scene.objects == "seen" else f", {row.scene.objects} objects"
     which = f", candidate {row.candidate + 1} of {row.candidates}" if row.candidates > 1 else ""
-    video = data_uri(path.read_bytes(), "video/mp4") if path.exists() else ""
+    video = data_uri(read_regular(path), "video/mp4") if path.exists() else ""
     return FailedEpisode(row.failure, cause, f"{row.variant}, scene {row.scene.seed}{objects}{which}", video)

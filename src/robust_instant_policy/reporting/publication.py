@@ -11,7 +11,7 @@ from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.evaluation.store import read_results
 from robust_instant_policy.evaluation.suites import CHOSEN
 from robust_instant_policy.evaluation.variant import Scene, Variant
-from robust_instant_policy.files import write_whole
+from robust_instant_policy.files import read_regular, write_whole
 from robust_instant_policy.policies import Plan
 from robust_instant_policy.reporting.evaluation import Section, evaluation_page
 from robust_instant_policy.reporting.figures import draw, encode
@@ -49,7 +49,7 @@ def publish(out: Path) -> str:
     write_whole(out / TABLE_FILE, text.encode())
     invocations = invocation_table(manifest.invocations, rows)
     write_whole(out / RUN_TABLE_FILE, invocations.markdown().encode())
-    trainings = {path.stem: path.read_bytes() for path in sorted((out / TRAINING_FOLDER).glob("*.svg"))}
+    trainings = {path.stem: read_regular(path) for path in sorted((out / TRAINING_FOLDER).glob("*.svg"))}
     page = evaluation_page(out, sections, trainings, rows, failures, lost, invocations)
     write_whole(out / PAGE_FILE, page.encode())
     return text

@@ -15,7 +15,7 @@ from plotly.offline import get_plotlyjs
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import write_whole
+from robust_instant_policy.files import open_regular, read_regular, write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.policy import Plan, Stage
 from robust_instant_policy.reporting.charts import (
@@ -76,7 +76,7 @@ class RunRecord:
     def load(cls, folder: Path) -> RunRecord:
         """Raises `DatasetError` where ``folder`` holds no run, or a damaged one."""
         try:
-            content = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+            content = json.loads(read_regular(folder / RUN_FILE))
             record = cls(**{**content, "stages": tuple(Stage(**stage) for stage in content["stages"])})
             _stage_table(record.stages)
             return record
@@ -110,7 +110,7 @@ def write_report(folder: str | Path) -> Path:
         record=record,
         shown_count=len(shown),
         facts=_facts(record, plan),
-        video=data_uri(video.read_bytes(), "video/mp4") if video.exists() else "",
+        video=data_uri(read_regular(video), "video/mp4") if video.exists() else "",
         overlay=_candidates_over_scene(observation, plan),
         seen=picture(observation.rgb, "new scene", marks=keypoint_marks(plan.pixels, plan.keypoint_confidence)),
         shown=shown[:SHOWN_DEMONSTRATIONS],
@@ -131,7 +131,7 @@ def write_report(folder: str | Path) -> Path:
 def _load_context(path: Path) -> list[Picture]:
     """The demonstrations' start images with their keypoints."""
     try:
-        with np.load(path, allow_pickle=False) as context:
+        with open_regular(path) as file, np.load(file, allow_pickle=False) as context:
             return [
                 picture(context[f"rgb_{index}"], f"demonstration {index}", marks=keypoint_marks(pixels))
                 for index, pixels in enumerate(context["pixels"])

@@ -38,7 +38,7 @@ def check_episodes(demonstrations: Sequence[Demonstration]) -> list[Finding]:
         named = ", ".join(f"{count} of {task or 'no task'!r}" for task, count in tasks.most_common(4))
         found.append(_error("tasks", f"demonstrations of several tasks are mixed: {named}; fit one task at a time"))
     found += _states(demonstrations) + _units(demonstrations) + _copies(demonstrations)
-    return found + _order_of_changes(demonstrations)
+    return found + _grasps(demonstrations) + _order_of_changes(demonstrations)
 
 
 def _lengths(demonstrations: Sequence[Demonstration]) -> list[Finding]:
@@ -78,6 +78,13 @@ def _states(demonstrations: Sequence[Demonstration]) -> list[Finding]:
     words = f"gripper states must be 0 or 1 (open, closed), {_these([i for i, _ in found])} holds {found[0][1]:g}; "
     advice = "record what is commanded, or threshold the measured opening (closed below half of it)"
     return [_error("gripper state", words + advice, state=found[0][1])]
+
+
+def _grasps(demonstrations: Sequence[Demonstration]) -> list[Finding]:
+    if any(np.ptp(demonstration.trajectory.gripper_state, axis=0).any() for demonstration in demonstrations):
+        return []
+    words = "no gripper opens or closes in any demonstration: what it grasps was not checked"
+    return [Finding("gripper state", "warning", f"{words}; if the task needs a grasp, its state was not recorded")]
 
 
 def _units(demonstrations: Sequence[Demonstration]) -> list[Finding]:

@@ -13,6 +13,7 @@ from robust_instant_policy.sanity.contact import GripperPath, gaps
 from robust_instant_policy.sanity.envelope import approaches
 from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.geometry import (
+    BURIED_M,
     CONSISTENT,
     MIN_SHARE,
     TOUCH_M,
@@ -104,6 +105,9 @@ def _measured(as_is: Evidence) -> str:
         return f"fingertips reach {-as_is.lowest * 1e3:.0f} mm below the table that the images show"
     if not as_is.is_clear:
         buried = float(np.median([c.buried for c in as_is.contacts]))
+        if buried < BURIED_M:
+            lowest = float(np.median([min(c.lowest, c.lowest_palm) for c in as_is.contacts]))
+            return f"the gripper reaches {-lowest * 1e3:.0f} mm below the table that the images show"
         return f"the palm passes {buried * 1e3:.0f} mm deep through what the images show"
     if as_is.touching < MIN_SHARE:
         if np.isfinite(as_is.grasp_gap) and as_is.grasp_gap > TOUCH_M:
