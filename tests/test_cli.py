@@ -41,7 +41,7 @@ def refused(arguments: list[str], capsys) -> tuple[int, str]:
         (["eval", "--demos", "0", "--out", "x"], 2, "at least 1"),
         (["demo", "--seed", "-1"], 2, "whole number"),
         (["plan", "--demos", "absent", "--observation", "absent.npz"], 1, "absent.npz"),
-        (["view", "--demos", "/"], 1, "no demonstrations folder"),
+        (["view", "--demos", "/"], 1, "not a demonstrations folder"),
         (["juggle"], 2, "juggle"),
     ],
 )
