@@ -35,7 +35,7 @@ def open_hdf5(path: Path) -> Iterator[Any]:
             yield file
     except FileNotFoundError:
         raise DatasetError(f"there is no file {path}") from None
-    except (OSError, RuntimeError, KeyError) as error:  # errors of h5py for damaged files
+    except (OSError, RuntimeError, KeyError, UnicodeDecodeError, SystemError) as error:  # of h5py for damaged files
         raise DatasetError(f"{path} is damaged or not an HDF5 file: {excerpt(error)}") from error
 
 
