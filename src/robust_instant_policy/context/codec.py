@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from robust_instant_policy.geometry import FloatArray
 
 MM = 1000.0  # per metre
+MAX_ANSWER_CHARS = 200_000  # of text that is read; a trajectory of one arm has about 1500
 ROW_DIGITS = 4  # of a number of a whole trajectory: up to 10 m
 
 _MINUS = str.maketrans(dict.fromkeys("−–—‒﹣－", "-"))
@@ -75,10 +76,14 @@ def read_row(text: str, columns: int) -> FloatArray | None:
 def read_rows(text: str, columns: int) -> FloatArray | None:
     """The rows ``(N, columns)`` of numbers in an answer, or None when one of them cannot be read for certain.
 
+    None, too, for a text of more than `MAX_ANSWER_CHARS`.
+
     Prose and code fences may surround the rows, and a last row that was cut off is left out. An answer is refused where
     a line before or between rows looks like a malformed row (a step would be missing), and where words stand between
     rows (those before them may be an example).
     """
+    if len(text) > MAX_ANSWER_CHARS:
+        return None
     rows: list[FloatArray] = []
     broken = False
     for line in _lines(text):
