@@ -230,7 +230,7 @@ def test_the_report_of_an_evaluation_shows_what_was_learned(workbench, demonstra
     command = ["eval", "--tasks", "push-cube", "--methods", "kat-dp", "--steps", "5", "--episodes", "1", "--no-videos"]
     places = ["--checkpoints", str(tmp_path), "--out", str(tmp_path / "run")]
     assert main([*command, "--demos", str(len(demonstrations)), *places]) == 0
-    (picture,) = (tmp_path / "run" / "training").glob("push-cube-kat-dp-*-5steps.svg")
+    (picture,) = (tmp_path / "run" / "training").glob("push-cube-kat-dp-*-5steps-*.svg")
     assert "demonstration 2" in picture.read_text()
     page = (tmp_path / "run" / "index.html").read_text()
     assert page.count('<h2 id="training">') == page.count('href="#training"') == 1

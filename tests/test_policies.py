@@ -1,5 +1,7 @@
 """Policies over keypoints, on recorded demonstrations; the promise that RIP succeeds, with the embedded model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from robust_instant_policy.policies import (
     build_context,
     locate,
 )
-from robust_instant_policy.policies.confidence import Evidence, plan_confidence
+from robust_instant_policy.policies.confidence import UNKNOWN, Evidence, novelty, plan_confidence
 from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.query import Answer
 from robust_instant_policy.tasks import make_task
@@ -150,13 +152,35 @@ def test_a_setting_that_makes_no_sense_is_refused_where_it_is_given(options):
     assert "\n" not in str(caught.value)
 
 
-def test_confidence_falls_with_agreement_and_with_recognition():
-    sure = plan_confidence(Evidence(0.95, np.full(10, 0.8)))
-    assert sure == 0.95
-    assert plan_confidence(Evidence(0.5, np.full(10, 0.8))) < sure
-    assert plan_confidence(Evidence(0.95, np.full(10, 0.27))) < 0.6
-    hidden = np.where(np.arange(10) == 3, 0.0, 0.8)
-    assert plan_confidence(Evidence(0.95, hidden)) == sure
+SURE = Evidence(agreement=0.9, keypoints=0.8, prediction=0.008, novelty=0.9, warnings=0, errors=0)
+
+
+@pytest.mark.parametrize(
+    "worse",
+    [{"agreement": 0.1}, {"keypoints": 0.3}, {"prediction": 0.05}, {"novelty": 4.0}, {"warnings": 2}],
+    ids=lambda worse: next(iter(worse)),
+)
+def test_confidence_falls_with_everything_that_speaks_against_a_plan(worse):
+    assert plan_confidence(SURE) > 0.95
+    assert plan_confidence(replace(SURE, **worse)) < plan_confidence(SURE) - 0.01
+
+
+def test_a_tie_or_an_error_of_a_check_leaves_no_confidence():
+    assert plan_confidence(replace(SURE, agreement=0.0)) == 0
+    assert plan_confidence(replace(SURE, errors=1)) == 0
+
+
+@pytest.mark.parametrize("unknown", ["prediction", "novelty"])
+def test_demonstrations_that_cannot_tell_bound_the_confidence(unknown):
+    assert plan_confidence(replace(SURE, **{unknown: float("nan")})) == UNKNOWN
+
+
+def test_demonstrations_of_one_scene_tell_nothing_about_others():
+    one_scene = np.zeros((10, 4, 3))
+    assert np.isnan(novelty(one_scene, np.full((4, 3), 0.1)))
+    apart = np.random.default_rng(0).normal(0, 0.1, (10, 4, 3))
+    assert novelty(apart, apart[3]) == 0
+    assert novelty(apart, apart[3] + 1.0) > 3
 
 
 def test_old_names_still_work_with_a_warning():

@@ -282,7 +282,7 @@ def test_asking_before_fitting_says_what_to_call(estimator):
 def test_the_benchmark_runs():
     command = [sys.executable, str(Path(__file__).parents[1] / "benchmarks" / "regression.py"), "--quick"]
     printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    for title in ("Smooth truths", "Piecewise truths", "Diagnosis", "Intervals", "Several ways", "Single bad steps"):
+    for title in ("Smooth truths", "Piecewise truths", "Diagnosis", "Intervals", "Several modes", "Single bad steps"):
         assert title in printed
 
 

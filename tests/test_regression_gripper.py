@@ -173,7 +173,7 @@ def test_a_majority_is_no_tie():
 def test_a_trajectory_of_one_step_has_no_curvature_and_yet_a_plan():
     step = GripperTriangle(length=0.1, opening=0.08).triplets(np.eye(4)[None]).reshape(1, 9)
     actions = np.concatenate([step, [[1.0]]], axis=1)
-    curvature = align([Trajectory.from_actions(actions)]).usual_bends()
+    curvature = align([Trajectory.from_actions(actions)]).curvature()
     fit = robust_gripper_trajectory([actions] * 3, curvature=curvature)
     assert np.allclose(fit.actions, actions)
 
