@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from robust_instant_policy.context import Prompt, leave_one_out, write_prompt
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception import KeypointExtractor, Located
 from robust_instant_policy.policies.confidence import recognition
@@ -67,8 +66,6 @@ def build_context(
     Raises `DatasetError` without demonstrations, `GeometryError` or `DemonstrationError` where they contradict
     themselves (`check_demonstrations`), and `KeypointError` where images have too little in common.
     """
-    if not demonstrations:
-        raise DatasetError("no demonstrations; show the task at least once (rip record)")
     report = check_demonstrations(demonstrations)
     report.raise_if_wrong()
     progress("keypoints", 0, 0)
