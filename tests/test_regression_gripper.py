@@ -121,7 +121,9 @@ def test_length_of_the_result_can_be_chosen():
 
 def test_bad_arguments_are_refused():
     good = draw_scene(0, "smooth", 3, 0).candidates
-    with pytest.raises(UnknownNameError, match="em, em-number, network-sim, network-real, network, mixture, median, mean"):
+    with pytest.raises(
+        UnknownNameError, match="em, em-number, network-sim, network-real, network, mixture, median, mean"
+    ):
         robust_gripper_trajectory(good, estimator="mode")
     with pytest.raises(InvalidValueError, match=r"\(T_q, 10·A\).*9"):
         robust_gripper_trajectory([c[:, :9] for c in good])

@@ -8,7 +8,15 @@ from functools import partial
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole, TrainingScreen
-from robust_instant_policy.commands.options import CHECKPOINTS, DATA, add_assets, add_method, positive, seed
+from robust_instant_policy.commands.options import (
+    CHECKPOINTS,
+    DATA,
+    add_assets,
+    add_method,
+    method_settings,
+    positive,
+    seed,
+)
 from robust_instant_policy.evaluation import (
     STORE_FILE,
     Analysis,
@@ -41,8 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--methods",
         nargs="+",
         metavar="METHOD",
-        help="of rip rip-gauss rip-adaptive kat dp kat-dp neighbours gp "
-        "(default: rip rip-gauss kat, or those of the suite)",
+        help="of rip rip-gauss mean rip-adaptive kat dp kat-dp neighbours gp "
+        "(default: rip rip-gauss mean kat, or those of the suite)",
     )
     parser.add_argument(
         "--demos", type=positive, default=10, metavar="N", help="demonstrations per task (default: %(default)s)"
@@ -79,20 +87,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--keep", action="store_true", help="do not repeat what another version of the code has executed"
     )
     parser.add_argument("--no-videos", action="store_true", help="no videos of failed episodes")
+    parser.add_argument("--no-analysis", action="store_true", help="no causes and videos of failed episodes")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to continue")
     add_method(parser)
 
 
 def run(options: argparse.Namespace) -> int:
+    settings = method_settings(options)
     base = Variant(
         "rip",
         demos=options.demos,
         queries=options.queries,
-        downsampling=options.downsampling,
-        frames=options.frames,
-        layout=options.layout,
-        features=options.features,
+        downsampling=settings.downsampling,
+        frames=settings.frames,
+        layout=settings.layout,
+        features=settings.features,
         model=model_name(options.llm),
+        keypoints=settings.keypoints,
+        column=settings.column,
+        estimator=settings.estimator,
     )
     steps = options.steps or DEFAULT_STEPS
     choice = Choice(
@@ -106,6 +119,7 @@ def run(options: argparse.Namespace) -> int:
         deadline_s=float(options.deadline),
         films=not options.no_videos,
         checkpoints=options.checkpoints,
+        analyses=not options.no_analysis,
     )
     workers: Workers = (
         LocalWorkers(options.workers or 1) if options.ray is None else RayWorkers(options.ray, options.workers)

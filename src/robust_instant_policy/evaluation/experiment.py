@@ -97,7 +97,7 @@ def run_suites(
         progress.outcome(done, len(trials), None)
         drawn = set(wanted_trials(suite for suite in suites if suite.keeps_plans))
         kept = [trial for trial in trials if _of_any_demonstrations(trial) in drawn]
-        works = missing_work(trials, kept, episodes, store.results().failures, out, setup.films)
+        works = missing_work(trials, kept, episodes, store.results().failures, out, setup.films, setup.analyses)
         if not works:
             return
         _train_missing(works, setup, progress)
@@ -172,6 +172,7 @@ def missing_work(
     failures: Sequence[Failure],
     out: Path,
     films: bool,
+    analyses: bool = True,
 ) -> list[SceneWork]:
     """What is still to be done for the ``wanted`` plans, of which those ``kept`` go into files, scene by scene."""
     left = executions_left(rows)
@@ -188,7 +189,7 @@ def missing_work(
         if row.trial in among:
             done[row.scene].add(row.key)
             filmed = not films or row.executed_seconds == 0 or (out / video_file(*row.key)).exists()
-            if not row.success and not (row.key in examined and filmed):
+            if analyses and not row.success and not (row.key in examined and filmed):
                 failed[row.scene].append(row)
     for scene, variant in kept:
         if not (out / plan_file(scene, variant)).exists():

@@ -20,8 +20,8 @@ class Setup:
     """What every worker needs to know: the language model, where samples and demonstrations are, and what to keep.
 
     ``llm`` is a line for `llm.connect`; with ``replay`` only stored answers are used. ``deadline_s`` bounds the
-    sampling for one plan. With ``films`` every failed episode is filmed. ``checkpoints`` is where methods that are
-    trained keep their weights.
+    sampling for one plan. With ``analyses`` every failed episode is analysed, and with ``films`` filmed.
+    ``checkpoints`` is where methods that are trained keep their weights.
     """
 
     llm: str
@@ -31,6 +31,7 @@ class Setup:
     deadline_s: float
     films: bool
     checkpoints: Path = DEFAULT_CHECKPOINTS
+    analyses: bool = True
 
 
 @dataclass(frozen=True)

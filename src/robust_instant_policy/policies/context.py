@@ -70,7 +70,12 @@ def build_context(
     report.raise_if_wrong()
     progress("keypoints", 0, 0)
     extractor = KeypointExtractor(
-        settings.num_keypoints, settings.features, workspace=settings.workspace, seed=settings.seed
+        settings.num_keypoints,
+        settings.features,
+        settings.workspace,
+        settings.seed,
+        settings.descriptors,
+        settings.keypoints,
     ).fit([demonstration.observation for demonstration in demonstrations])
     trajectories = tuple(
         downsample(demonstration.trajectory, settings.downsampling, settings.num_steps)

@@ -20,7 +20,7 @@ from robust_instant_policy.evaluation.statistics import (
     reference,
     t_test,
 )
-from robust_instant_policy.evaluation.variant import Variant, by_demos, dof_symbol, labels, values
+from robust_instant_policy.evaluation.variant import Variant, by_demos, configs, dof_symbol, labels, values
 from robust_instant_policy.policies import METHOD_NAMES
 
 NONE = "–"
@@ -45,36 +45,44 @@ def tables(summary: Summary) -> list[Table]:
 
 
 def success_table(summary: Summary) -> Table:
-    """Table I: one row a method, for each task the success rate in percent and the paper's own beside it."""
-    ours = reference(summary.variants)
-    told = [task for task in summary.tasks if task in paper.TABLE1_TASKS]
+    """Table I: one row a method, for each task the success rate in percent, and the paper's own beside rows of its
+    configuration.
+    """
+    ours, variants = reference(summary.variants), summary.variants
+    told = [task for task in summary.tasks if task in paper.TABLE1_TASKS] if paper.is_told(variants) else []
     head = ["method"]
     for task in summary.tasks:
-        head += [task, "paper"] if task in told else [task]
+        of_paper = "paper, physical robot" if task.startswith("aloha") else "paper"
+        head += [task, of_paper] if task in told else [task]
     rows = []
     for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
         row = [label]
         for task in summary.tasks:
             row.append(_cell(summary.rate(variant, task), summary.best(task)))
             if task in told:
-                percent = paper.table1(variant.method, task)
+                percent = paper.told(variant, task, variants)
                 row.append(NONE if percent is None else str(percent))
         stars = ""
         if ours is not None and variant != ours:
             own, others = _both(summary, ours, variant)
             stars = mark(t_test(own, others)) if own and fmean(own) > fmean(others) else ""
         tried = [task for task in told if summary.rate(variant, task) is not None]
-        row += [_spread(summary, variant, stars), _paper_average(variant, tried)]
+        row.append(_spread(summary, variant, stars))
+        if told:
+            row.append(_paper_average(variant, tried, variants))
         rows.append(tuple(row))
     counts = ", ".join(
         f"{label} {_executions(summary, variant)}"
         for variant, label in zip(summary.variants, labels(summary.variants), strict=True)
     )
+    averages = (
+        "the method was tried in, the paper's over the same; RIP is " if told else "the method was tried in; RIP is "
+    )
     return Table(
-        (*head, "average", "paper"),
+        (*head, "average", *(["paper"] if told else [])),
         tuple(rows),
-        "Success in percent; in parentheses Wilson's 95% interval; the best of a task is bold. Averages are mean ± "
-        "standard deviation over the tasks that the method was tried in, the paper's over the same; RIP is "
+        f"{_configuration(variants)}Success in percent; in parentheses Wilson's 95% interval; the best of a task is "
+        f"bold. Averages are mean ± standard deviation over the tasks that {averages}"
         "significantly better than those marked \\* or \\*\\* (t-test as in the paper, p < 0.05 and p < 0.005). "
         f"Executions a task: {counts}.",
     )
@@ -123,6 +131,7 @@ def sweep_table(summary: Summary, name: str, value: Callable[[Variant], str]) ->
     return Table(
         head,
         tuple(rows),
+        f"{_configuration(summary.variants)}"
         f"Success of {summary.variants[0].method} in percent, {summary.variants[0].demos} demonstrations shown; in "
         "parentheses Wilson's 95% interval; the best of a task is bold. Averages: mean ± standard deviation over "
         f"tasks. Executions a task: {', '.join(counts)}.",
@@ -148,6 +157,7 @@ def demos_table(summary: Summary) -> Table:
     return Table(
         ("method", *(f"{count} shown" for count in counts)),
         tuple(rows),
+        f"{_configuration(summary.variants)}"
         f"Success in percent, mean ± standard deviation over {', '.join(summary.tasks)}; in parentheses Wilson's 95% "
         "interval of all n executions together.",
     )
@@ -157,15 +167,20 @@ def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> T
     """How many failures of each method each stage caused."""
     keys = {row.key for row in episodes}
     known = [failure for failure in failures if failure.key in keys]
-    methods = sorted({row.variant.method for row in episodes}, key=METHOD_NAMES.index)
+    kinds = sorted(
+        {(row.variant.config, row.variant.method) for row in episodes},
+        key=lambda kind: (kind[0], METHOD_NAMES.index(kind[1])),
+    )
+    apart = len({config for config, _ in kinds if config}) > 1
     stages_met = [stage for stage in STAGES if any(failure.stage == stage for failure in known)]
     rows = []
-    for method in methods:
-        executions = [row for row in episodes if row.variant.method == method]
+    for config, method in kinds:
+        executions = [row for row in episodes if (row.variant.config, row.variant.method) == (config, method)]
         lost = sum(not row.success for row in executions)
-        stages = [failure.stage for failure in known if failure.variant.method == method]
+        stages = [one.stage for one in known if (one.variant.config, one.variant.method) == (config, method)]
         cells = [f"{stages.count(stage)} ({stages.count(stage) / lost:.0%})" if lost else NONE for stage in stages_met]
-        rows.append((method, str(len(executions)), str(lost), *cells, str(lost - len(stages))))
+        label = f"{method} ({config})" if apart and config else method
+        rows.append((label, str(len(executions)), str(lost), *cells, str(lost - len(stages))))
     return Table(
         ("method", "executions", "failed", *(f"{stage} off" for stage in stages_met), "not examined"),
         tuple(rows),
@@ -184,7 +199,8 @@ def invocation_table(invocations: Sequence[Invocation], episodes: Sequence[Episo
     models = sorted({row.variant.model for row in episodes if row.variant.model})
     shared: dict[tuple, float] = {}  # methods that share samples each count the time of sampling
     for row in episodes:
-        samples = row.scene, row.variant.demos, row.variant.downsampling, row.variant.frames, row.variant.layout
+        own = row.variant
+        samples = row.scene, own.demos, own.downsampling, own.keypoints, own.frames, own.layout, own.model
         shared[samples] = max(shared.get(samples, 0.0), row.seconds)
     planning = sum(shared.values()) / 3600
     physics = sum(row.physics_seconds for row in episodes) / 3600
@@ -217,8 +233,17 @@ def _spread(summary: Summary, variant: Variant, stars: str = "") -> str:
     return f"{100 * mean:.1f}{stars.replace('*', chr(92) + '*')} ± {100 * deviation:.1f}"
 
 
-def _paper_average(variant: Variant, tasks: Sequence[str]) -> str:
-    rates = [rate for task in tasks if (rate := paper.table1(variant.method, task)) is not None]
+def _configuration(variants: Sequence[Variant]) -> str:
+    """A sentence that names the configuration, and the descriptors where they are not the paper's DINO."""
+    named = [config for config in configs(variants) if config]
+    features = sorted({one.features for one in variants if one.features and one.keypoints} - {"auto"})
+    words = [f"Configuration: {' and '.join(named)}"] if named else []
+    words += [f"descriptors: {' and '.join(features)}"] if features else []
+    return f"{'; '.join(words)}. " if words else ""
+
+
+def _paper_average(variant: Variant, tasks: Sequence[str], beside: Sequence[Variant]) -> str:
+    rates = [rate for task in tasks if (rate := paper.told(variant, task, beside)) is not None]
     return "{:.0f} ± {:.0f}".format(*mean_and_deviation(rates)) if rates else NONE
 
 
@@ -241,6 +266,8 @@ def _with_tests(summary: Summary) -> list[Table]:
 
 def _downsampling(summary: Summary) -> list[Table]:
     table = sweep_table(summary, "downsampling", lambda variant: variant.downsampling)
+    if not paper.is_told(summary.variants):
+        return [table]
     told = [str(paper.DOWNSAMPLING[variant.downsampling]) for variant in summary.variants]
     row = ("paper, average of five tasks", *told)
     return [Table(table.head, (*table.rows, row), table.note)]
