@@ -319,14 +319,45 @@ def test_an_unknown_suite_task_or_method_is_told():
         make_suites(["table1"], Choice(RIP, methods=["magic"]))
 
 
-def test_the_table_counts_every_execution_marks_the_best_and_shows_the_papers_number():
+PAPER = {"frames": "world", "layout": "sequence", "keypoints": "nearest", "column": "sim", "estimator": "network-sim"}
+
+
+def test_the_table_counts_every_execution_and_marks_the_best():
     suite = Suite("table1", ("push-cube",), (RIP, KAT), tuple(range(4)))
     rows = [episode(RIP, seed, True) for seed in range(4)]
     rows += [episode(KAT, seed, candidate < 2, candidate, of=5) for seed in range(4) for candidate in range(5)]
     success, tests = (table.markdown() for table in tables(Summary(suite, rows)))
-    assert "| rip | **100** (51 to 100) | 100 | 100.0 ± 0.0 | 100 ± 0 |" in success
-    assert "| kat | 40 (22 to 61) | 74 | 40.0 ± 0.0 | 74 ± 0 |" in success
+    assert "| rip | **100** (51 to 100) | 100.0 ± 0.0 |" in success
+    assert "| kat | 40 (22 to 61) | 40.0 ± 0.0 |" in success
     assert "| kat | +60.0 | – | 4 | 4 | 0 | 0.125 |" in tests
+
+
+def test_the_papers_numbers_stand_beside_rows_of_its_configuration_only(tmp_path):
+    dp = Variant("dp")
+    ours = (RIP, replace(RIP, **PAPER), replace(RIP, **PAPER | {"keypoints": "registration"}), dp)
+    assert [one.config for one in ours] == ["adaptive", "paper", "paper, keypoints registration", ""]
+    a_run(tmp_path, Suite("table1", ("push-cube",), ours, (1,)), [episode(one, 1, True) for one in ours], [])
+    publish(tmp_path)
+    heads = {path.name: path.read_text().splitlines() for path in tmp_path.glob("table1-*.md")}
+    assert heads.keys() == {"table1-adaptive.md", "table1-paper.md", "table1-paper-keypoints-registration.md"}
+    assert heads["table1-paper.md"][0] == "| method | push-cube | paper | average | paper |"
+    assert [line.split(" | ")[2] for line in heads["table1-paper.md"][2:4]] == ["100", "30"]
+    for name in heads.keys() - {"table1-paper.md"}:
+        assert heads[name][0] == "| method | push-cube | average |"
+    assert "Configuration: adaptive" in "".join(heads["table1-adaptive.md"])
+    assert set(pq.read_table(tmp_path / "episodes.parquet")["config"].to_pylist()) == {one.config for one in ours}
+
+
+def test_the_papers_estimator_fitted_exactly_is_a_row_of_its_own_in_its_configuration():
+    network = replace(RIP, **PAPER)
+    exact = replace(network, estimator="em-number")
+    assert exact != network
+    assert exact.config == network.config == "paper"
+    assert labels([network, exact, RIP]) == [
+        "rip (config paper, estimator network-sim)", "rip (config paper, estimator em-number)",
+        "rip (config adaptive, estimator em)",
+    ]  # fmt: skip
+    assert len({one.file_name for one in (network, exact, RIP)}) == 3
 
 
 @pytest.mark.parametrize("name", ["demos", "queries", "dof", "downsampling"])
@@ -453,12 +484,12 @@ def test_what_table1_shows_has_no_section_of_its_own_in_the_report(tmp_path):
     table1, chosen = (Suite(name, ("push-cube",), (RIP,), (1,)) for name in ("table1", "chosen"))
     a_run(tmp_path, chosen, [episode(RIP, 1, True)], [])
     publish(tmp_path)
-    assert (tmp_path / "chosen.md").exists()
-    (tmp_path / "chosen.md").unlink()
+    assert (tmp_path / "chosen-adaptive.md").exists()
+    (tmp_path / "chosen-adaptive.md").unlink()
     a_run(tmp_path, table1, [], [])
     publish(tmp_path)
-    assert (tmp_path / "table1.md").exists()
-    assert not (tmp_path / "chosen.md").exists()
+    assert (tmp_path / "table1-adaptive.md").exists()
+    assert not (tmp_path / "chosen-adaptive.md").exists()
 
 
 def test_a_terminal_that_knows_ascii_only_shows_other_signs(tmp_path):
@@ -485,8 +516,8 @@ def test_objects_of_code_and_downloaded_ones_have_a_table_each(tmp_path):
         suite = Suite("table1", ("push-cube",), (KAT,), (1,), assets=assets)
         a_run(tmp_path, suite, [replace(episode(KAT, 1, won), scene=scene)], [])
     publish(tmp_path)
-    assert "**100**" in (tmp_path / "table1.md").read_text()
-    assert "**0**" in (tmp_path / "table1-maniskill.md").read_text()
+    assert "**100**" in (tmp_path / "table1-adaptive.md").read_text()
+    assert "**0**" in (tmp_path / "table1-adaptive-maniskill.md").read_text()
 
 
 def test_a_worker_stays_with_its_task_and_others_take_another():
