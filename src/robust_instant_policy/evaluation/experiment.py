@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from robust_instant_policy.datasets import layout
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey, Trial
+from robust_instant_policy.evaluation.episodes import Episode, Trial
 from robust_instant_policy.evaluation.failures import Failure, video_file
 from robust_instant_policy.evaluation.manifest import code_digest
 from robust_instant_policy.evaluation.scenes import (
@@ -82,30 +81,31 @@ def run_suites(
         closing(ResultsStore(out)) as store,
         store.invocation(suites, arguments, model_name(setup.llm)),
     ):
-        episodes = store.results().episodes
-        trials = _with_demonstrations(wanted_trials(suites), episodes, setup, progress, keep)
-        left = executions_left(episodes)
+        results = store.results()
+        executed = by_trial(results.episodes)
+        trials = _with_demonstrations(wanted_trials(suites), executed, setup, progress, keep)
         if keep:
-            complete = {_of_any_code(trial) for trial, count in left.items() if count == 0}
-            trials = [trial for trial in trials if trial in left or _of_any_code(trial) not in complete]
-        if repeated := _superseded(trials, episodes):
+            complete = {_apart_from("code", trial) for trial, rows in executed.items() if is_complete(rows)}
+            trials = [trial for trial in trials if trial in executed or _apart_from("code", trial) not in complete]
+        if repeated := _superseded(trials, executed):
             progress.note(
                 f"{repeated} plans were executed with other code, demonstrations, features or deadline; these rows "
                 "stay apart, and the plans are executed again (--keep leaves out what only the code tells apart)"
             )
-        done = sum(left.get(trial) == 0 for trial in trials)
+        done = sum(is_complete(executed.get(trial, ())) for trial in trials)
         progress.outcome(done, len(trials), None)
         drawn = set(wanted_trials(suite for suite in suites if suite.keeps_plans))
-        kept = [trial for trial in trials if _of_any_demonstrations(trial) in drawn]
-        works = missing_work(trials, kept, episodes, store.results().failures, out, setup.films)
+        kept = {trial for trial in trials if _apart_from("demonstrations", trial) in drawn}
+        works = missing_work(trials, kept, executed, results.failures, out, setup.films)
         if not works:
             return
         _train_missing(works, setup, progress)
         for outcome in workers(setup, works):
             if isinstance(outcome, Episode):
                 store.add(outcome)
-                left[outcome.trial] = left.get(outcome.trial, outcome.candidates) - 1
-                done += left[outcome.trial] == 0
+                rows = executed.setdefault(outcome.trial, [])
+                rows.append(outcome)
+                done += is_complete(rows)
             elif isinstance(outcome, Planned):
                 path = out / plan_file(outcome.scene, outcome.variant)
                 path.parent.mkdir(exist_ok=True)
@@ -147,12 +147,17 @@ def wanted_trials(suites: Iterable[Suite]) -> list[Trial]:
     return [(scene, variant) for scene, variants in by_scene.items() for variant in variants]
 
 
-def executions_left(rows: Iterable[Episode]) -> dict[Trial, int]:
-    """How many executions the plans that were begun still lack."""
-    left: dict[Trial, int] = {}
+def by_trial(rows: Iterable[Episode]) -> dict[Trial, list[Episode]]:
+    """The executions of each plan."""
+    executed: dict[Trial, list[Episode]] = {}
     for row in rows:
-        left[row.trial] = left.get(row.trial, row.candidates) - 1
-    return left
+        executed.setdefault(row.trial, []).append(row)
+    return executed
+
+
+def is_complete(rows: Sequence[Episode]) -> bool:
+    """Whether ``rows`` are all executions of their plan."""
+    return bool(rows) and len(rows) == rows[0].candidates
 
 
 def plan_file(scene: Scene, variant: Variant) -> str:
@@ -166,75 +171,62 @@ def training_file(task: str, variant: Variant) -> str:
 
 
 def missing_work(
-    wanted: Sequence[Trial],
-    kept: Sequence[Trial],
-    rows: Sequence[Episode],
-    failures: Sequence[Failure],
+    trials: Iterable[Trial],
+    kept: Collection[Trial],
+    executed: Mapping[Trial, Sequence[Episode]],
+    failures: Iterable[Failure],
     out: Path,
     films: bool,
 ) -> list[SceneWork]:
-    """What is still to be done for the ``wanted`` plans, of which those ``kept`` go into files, scene by scene."""
-    left = executions_left(rows)
-    examined = {row.key for row in failures}
-    todo: defaultdict[Scene, list[Variant]] = defaultdict(list)
-    plans: defaultdict[Scene, list[Variant]] = defaultdict(list)
-    done: defaultdict[Scene, set[EpisodeKey]] = defaultdict(set)
-    failed: defaultdict[Scene, list[Episode]] = defaultdict(list)
-    for scene, variant in wanted:
-        if left.get((scene, variant)) != 0:
-            todo[scene].append(variant)
-    among = set(wanted)
-    for row in rows:
-        if row.trial in among:
-            done[row.scene].add(row.key)
-            filmed = not films or row.executed_seconds == 0 or (out / video_file(*row.key)).exists()
-            if not row.success and not (row.key in examined and filmed):
-                failed[row.scene].append(row)
-    for scene, variant in kept:
-        if not (out / plan_file(scene, variant)).exists():
-            plans[scene].append(variant)
-    return [
-        SceneWork(scene, tuple(todo[scene]), frozenset(done[scene]), tuple(failed[scene]), tuple(plans[scene]))
-        for scene in dict.fromkeys(scene for scene, _ in wanted)
-        if todo[scene] or failed[scene] or plans[scene]
-    ]
+    """What is still to be done for ``trials``, of which the plans of those ``kept`` go into files, scene by scene."""
+    examined = {failure.key for failure in failures}
+
+    def is_analysed(row: Episode) -> bool:
+        filmed = not films or row.executed_seconds == 0 or (out / video_file(*row.key)).exists()
+        return row.key in examined and filmed
+
+    works: dict[Scene, SceneWork] = {}
+    for scene, variant in trials:
+        rows = executed.get((scene, variant), ())
+        planned = (scene, variant) not in kept or (out / plan_file(scene, variant)).exists()
+        work = works.get(scene, SceneWork(scene))
+        works[scene] = SceneWork(
+            scene,
+            work.variants if is_complete(rows) else (*work.variants, variant),
+            work.done.union(row.key for row in rows),
+            (*work.failed, *(row for row in rows if not row.success and not is_analysed(row))),
+            work.plans if planned else (*work.plans, variant),
+        )
+    return [work for work in works.values() if work.concerned]
 
 
-def _of_any_code(trial: Trial) -> Trial:
+def _apart_from(settings: str, trial: Trial) -> Trial:
+    """``trial`` with the ``settings`` of its variant, separated by spaces, left empty."""
     scene, variant = trial
-    return scene, replace(variant, code="")
+    empty: dict[str, Any] = dict.fromkeys(settings.split())
+    return scene, replace(variant, **empty)
 
 
-def _of_any_demonstrations(trial: Trial) -> Trial:
-    scene, variant = trial
-    return scene, replace(variant, demonstrations="")
-
-
-def _superseded(trials: Sequence[Trial], rows: Sequence[Episode]) -> int:
+def _superseded(trials: Iterable[Trial], executed: Collection[Trial]) -> int:
     """How many of ``trials`` lack executions, but have some that differ only in settings that no user chose."""
-
-    def chosen(trial: Trial) -> Trial:
-        scene, variant = trial
-        return scene, replace(variant, code="", demonstrations="", features="", deadline_s=None)
-
-    own = {row.trial for row in rows}
-    begun = {chosen(trial) for trial in own}
-    return sum(trial not in own and chosen(trial) in begun for trial in trials)
+    chosen = partial(_apart_from, "code demonstrations features deadline_s")
+    begun = set(map(chosen, executed))
+    return sum(trial not in executed and chosen(trial) in begun for trial in trials)
 
 
 def _with_demonstrations(
-    trials: Sequence[Trial], rows: Sequence[Episode], setup: Setup, progress: Progress, keep: bool
+    trials: Sequence[Trial],
+    executed: Mapping[Trial, Sequence[Episode]],
+    setup: Setup,
+    progress: Progress,
+    keep: bool,
 ) -> list[Trial]:
     """``trials`` with the digest of the demonstrations that they are shown, which are recorded where they are missing.
 
-    Where a task's demonstrations are not at hand, and nothing that is wanted of it lacks executions, those that the
-    rows tell of are taken.
+    Where a task's demonstrations are not at hand, and all its executions are, the digests of those rows are taken.
     """
-
-    def plain(trial: Trial) -> Trial:
-        return _of_any_demonstrations(_of_any_code(trial) if keep else trial)
-
-    done = {plain(trial): trial[1].demonstrations for trial, left in executions_left(rows).items() if left == 0}
+    plain = partial(_apart_from, "code demonstrations" if keep else "demonstrations")
+    done = {plain(trial): trial[1].demonstrations for trial, rows in executed.items() if is_complete(rows)}
     most: dict[tuple[str, bool], int] = {}
     for scene, variant in trials:
         for with_images in {False, variant.method in IMAGE_METHODS}:

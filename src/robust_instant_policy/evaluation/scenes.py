@@ -15,14 +15,13 @@ from robust_instant_policy.tasks.record import record
 from robust_instant_policy.tasks.task import Task, bounded_seed
 
 FIRST_TEST_SEED = 100_000  # demonstrations draw scenes from 0 on, tests from here on
-SEED_BITS = 62  # of a scene's seed, which stands in tables of 64-bit integers
 SEEDS_A_RUN = 1_000  # apart, so that runs with different --seed share no scene
 IMAGES_HZ = 11.0  # about the rate at which demonstrations with images are recorded; rendering them takes long
 
 
 def scene_seed(seed: int, index: int) -> int:
     """Seed of the ``index``-th test scene of a run with ``--seed seed``."""
-    return bounded_seed(FIRST_TEST_SEED + seed * SEEDS_A_RUN + index, SEED_BITS)
+    return bounded_seed(FIRST_TEST_SEED + seed * SEEDS_A_RUN + index)
 
 
 def demonstrations_folder(data: Path, task: str, with_images: bool) -> Path:

@@ -60,7 +60,7 @@ class SceneWork:
     """
 
     scene: Scene
-    variants: tuple[Variant, ...]
+    variants: tuple[Variant, ...] = ()
     done: frozenset[EpisodeKey] = frozenset()
     failed: tuple[Episode, ...] = ()
     plans: tuple[Variant, ...] = ()

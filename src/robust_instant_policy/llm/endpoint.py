@@ -61,10 +61,6 @@ class Endpoint:
     def context_length(self) -> int | None:
         return _run(self._facts()).context_length
 
-    @property
-    def counts_exactly(self) -> bool:
-        return _run(self._facts()).counts_tokens
-
     def count_tokens(self, text: str) -> int:
         async def count() -> int:
             async with contextlib.aclosing(self.connection()) as connection:

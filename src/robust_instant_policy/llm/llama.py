@@ -92,8 +92,6 @@ class LlamaModel:
     Without ``context_length`` (tokens) the model is loaded at once and llama.cpp is asked. Raises `ModelError`.
     """
 
-    counts_exactly = True
-
     def __init__(self, path: Path, name: str, context_length: int | None = None):
         if not path.is_file():
             raise ModelError(f"no model file at {path}; give the path of a .gguf file")

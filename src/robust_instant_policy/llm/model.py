@@ -65,7 +65,7 @@ class LanguageModel(Protocol):
     """A model that continues text.
 
     ``name`` identifies its weights in the sample store. ``context_length`` is in tokens, None when the server does not
-    tell. ``counts_exactly`` tells whether `count_tokens` is the model's own count or an estimate.
+    tell. `count_tokens` estimates where the server has no tokenizer.
     """
 
     @property
@@ -73,9 +73,6 @@ class LanguageModel(Protocol):
 
     @property
     def context_length(self) -> int | None: ...
-
-    @property
-    def counts_exactly(self) -> bool: ...
 
     def count_tokens(self, text: str) -> int: ...
 

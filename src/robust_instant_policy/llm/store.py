@@ -208,10 +208,6 @@ class RecordedModel:
     def context_length(self) -> int | None:
         return self._model.context_length
 
-    @property
-    def counts_exactly(self) -> bool:
-        return self._model.counts_exactly
-
     def count_tokens(self, text: str) -> int:
         return self._model.count_tokens(text)
 
@@ -261,8 +257,6 @@ class ReplayedModel:
 
     A model file's name without its digest will do, where only one file of that name was asked.
     """
-
-    counts_exactly = False
 
     def __init__(self, store: SampleStore, name: str):
         known = store.names()
