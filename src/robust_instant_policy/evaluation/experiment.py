@@ -1,4 +1,4 @@
-"""Experiments: suites of variants in scenes, done by workers, kept row by row, resumable at any moment."""
+"""Run suites of variants in scenes with a pool of workers; each row is stored at once, so a run can be resumed."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def ignore(*_: object) -> None:
 
 @dataclass(frozen=True)
 class Progress:
-    """Called as the run goes on: ``recording(task, there, wanted, thrown away)``, ``outcome(trials done, trials wanted,
-    what has just come, or None at the start)``, ``training`` while a method is trained, ``trained(task, variant,
-    policy)`` when that is done, and ``note`` with a line that the user should read.
+    """Callbacks: ``recording(task, episodes stored, episodes wanted, attempts discarded)``, ``outcome(plans done, plans
+    wanted, the new outcome, or None at the start)``, ``training`` while a method is trained, ``trained(task, variant,
+    policy)`` after that, and ``note`` with a line for the user.
     """
 
     recording: Callable[[str, int, int, int], None] = ignore
@@ -67,12 +67,11 @@ def run_suites(
     arguments: Sequence[str] = ("(called from Python)",),
     keep: bool = False,
 ) -> None:
-    """Run what is missing of ``suites`` in ``out``: executions, and the analysis of those that failed.
+    """Run what is missing of ``suites`` in ``out``: executions, and the analysis of failed ones.
 
-    Demonstrations are kept in ``setup.data/TASK`` and recorded where they are missing. What several suites ask for is
-    done once, and everything in one scene together, so that its samples are asked for once. Rows of another version of
-    the code are not counted as done unless ``keep``; rows with other demonstrations never are. ``arguments`` are the
-    words of the command, noted in the manifest.
+    Missing demonstrations are recorded in ``setup.data/TASK``. Plans that several suites contain are made once, and all
+    plans of a scene together, so that they share samples. Rows of another version of the code do not count as done
+    unless ``keep``; rows with other demonstrations never do. The manifest stores ``arguments``, the command line.
     """
     suites = [identified(suite, setup) for suite in suites]
     make_folder(out)
@@ -120,8 +119,8 @@ def run_suites(
 
 @contextmanager
 def one_writer(out: Path) -> Iterator[None]:
-    """Keep other processes from writing into the run's folder ``out``; `DatasetError` when one does, and for a folder
-    of demonstrations."""
+    """Lock the run's folder ``out``. Raises `DatasetError` if another process writes to it, or if it holds
+    demonstrations."""
     if (out / layout.RIP_PATH).exists() or (out / layout.INFO_PATH).exists():
         raise DatasetError(f"{out} holds demonstrations; give a folder of its own for the results")
     descriptor = lock_folder(out)
@@ -132,14 +131,14 @@ def one_writer(out: Path) -> Iterator[None]:
 
 
 def identified(suite: Suite, setup: Setup) -> Suite:
-    """``suite`` with all that decides its rows but the demonstrations: network, code, deadline."""
+    """``suite`` with the keys of its rows filled in, except the demonstrations: network, code, deadline."""
     decided = partial(replace, code=code_digest(), deadline_s=setup.deadline_s)
     variants = (decided(variant, features=resolve_features(variant.features)) for variant in suite.variants)
     return replace(suite, variants=tuple(variants))
 
 
 def wanted_trials(suites: Iterable[Suite]) -> list[Trial]:
-    """Every plan that ``suites`` ask for, once, those of one scene together."""
+    """The plans of all ``suites``, each once, ordered by scene."""
     by_scene: dict[Scene, dict[Variant, None]] = {}
     for suite in suites:
         for scene in suite.scenes:
@@ -161,12 +160,12 @@ def is_complete(rows: Sequence[Episode]) -> bool:
 
 
 def plan_file(scene: Scene, variant: Variant) -> str:
-    """Where, in a run's folder, a plan is kept that is to be drawn."""
+    """Path in a run's folder of a plan that is stored for a figure."""
     return f"{PLAN_FOLDER}/{scene}-{variant.file_name}.json"
 
 
 def training_file(task: str, variant: Variant) -> str:
-    """Where, in a run's folder, a picture is kept of how a method learned ``task``."""
+    """Path in a run's folder of the figure about the training of ``variant`` on ``task``."""
     return f"{TRAINING_FOLDER}/{task}-{variant.file_name}.svg"
 
 
@@ -178,7 +177,7 @@ def missing_work(
     out: Path,
     films: bool,
 ) -> list[SceneWork]:
-    """What is still to be done for ``trials``, of which the plans of those ``kept`` go into files, scene by scene."""
+    """The missing work for ``trials``, one value a scene. The plans of the trials in ``kept`` are stored in files."""
     examined = {failure.key for failure in failures}
 
     def is_analysed(row: Episode) -> bool:
@@ -201,14 +200,14 @@ def missing_work(
 
 
 def _apart_from(settings: str, trial: Trial) -> Trial:
-    """``trial`` with the ``settings`` of its variant, separated by spaces, left empty."""
+    """``trial`` without the ``settings`` of its variant (names separated by spaces)."""
     scene, variant = trial
     empty: dict[str, Any] = dict.fromkeys(settings.split())
     return scene, replace(variant, **empty)
 
 
 def _superseded(trials: Iterable[Trial], executed: Collection[Trial]) -> int:
-    """How many of ``trials`` lack executions, but have some that differ only in settings that no user chose."""
+    """Number of ``trials`` without executions for which there are executions with other code, demonstrations, …"""
     chosen = partial(_apart_from, "code demonstrations features deadline_s")
     begun = set(map(chosen, executed))
     return sum(trial not in executed and chosen(trial) in begun for trial in trials)
@@ -221,9 +220,9 @@ def _with_demonstrations(
     progress: Progress,
     keep: bool,
 ) -> list[Trial]:
-    """``trials`` with the digest of the demonstrations that they are shown, which are recorded where they are missing.
+    """``trials`` with the digest of their demonstrations. Missing demonstrations are recorded.
 
-    Where a task's demonstrations are not at hand, and all its executions are, the digests of those rows are taken.
+    If demonstrations of a task are missing but all its executions are there, the digests of these rows are used.
     """
     plain = partial(_apart_from, "code demonstrations" if keep else "demonstrations")
     done = {plain(trial): trial[1].demonstrations for trial, rows in executed.items() if is_complete(rows)}
@@ -261,7 +260,7 @@ def _record(
 
 
 def _train_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:
-    """Have checkpoints of everything that is trained, before workers would all train it at once."""
+    """Train all methods that need it, before the workers start: each of them would train."""
     trained: dict[tuple[str, Variant], SceneWork] = {}
     for work in works:
         for variant in work.concerned:
