@@ -15,7 +15,7 @@ DEADLINE_S = 300.0  # wall time for all the answers of one plan; a busy laptop m
 MAX_ROUNDS = 8  # attempts at one sample before it is given up
 QUOTED_CHARS = 160  # of a refused answer, in messages
 
-Accept = Callable[[int, str], Any]  # query index, text -> what the answer says; None or False to refuse it
+Accept = Callable[[int, str], Any]  # query index, text -> parsed value; None or False to refuse the answer
 OnProgress = Callable[[int, int], None]  # accepted answers, wanted answers
 OnAnswer = Callable[[int, int, int, Answer, bool], None]  # query index, sample index, attempt, answer, accepted
 
@@ -40,8 +40,8 @@ class Sampling:
 class Listener:
     """Callbacks for answers as they arrive.
 
-    ``accept`` reads an answer once; its result becomes `Answer.value`. An answer for which it returns None (or False)
-    is refused and sampled again. ``on_answer`` gets every answer, the refused ones too.
+    ``accept`` parses an answer once; its result becomes `Answer.value`. An answer for which it returns None or False
+    is refused and sampled again. ``on_answer`` receives every answer, including refused ones.
     """
 
     accept: Accept | None = None
