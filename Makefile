@@ -25,7 +25,7 @@ test: export OMP_NUM_THREADS := 1
 test: export OPENBLAS_NUM_THREADS := 1
 test: setup
 	@$(MAKE) --no-print-directory lint
-	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --cov --cov-report= $(ARGS)
+	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --cov --cov-report= $(ARGS)
 	@.venv/bin/python scripts/coverage_table.py
 
 clean:

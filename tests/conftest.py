@@ -11,6 +11,13 @@ from filelock import FileLock
 from robust_instant_policy.cli import main
 
 NUM_DEMONSTRATIONS = 5
+# These files take the most time. They come first, so that all workers end at about the same time.
+LONGEST = ("evaluation_workers", "diffusion", "demo", "tasks_aloha", "llm_embedded", "docs")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    places = {f"test_{name}": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 
 
 @pytest.fixture(scope="session", autouse=True)
