@@ -6,12 +6,12 @@ import argparse
 from pathlib import Path
 
 from robust_instant_policy.policies.settings import CONFIGS, WORDS, Settings
+from robust_instant_policy.tasks.level import LEVELS, PAPER
 from robust_instant_policy.tasks.task import bounded_seed
 
 DATA = Path("data")  # demonstrations, one folder per task
 RUNS = Path("runs")
 CHECKPOINTS = Path("checkpoints")
-SEED_BITS = 62  # seeds, and those counted up from them, stand in tables of 64-bit integers
 
 
 def natural(text: str) -> int:
@@ -23,7 +23,7 @@ def natural(text: str) -> int:
 
 def seed(text: str) -> int:
     """A whole number, 0 or more; one that is too large for simulators and tables is mapped to a smaller one."""
-    return bounded_seed(natural(text), SEED_BITS)
+    return bounded_seed(natural(text))
 
 
 def positive(text: str) -> int:
@@ -40,6 +40,22 @@ def add_assets(parser: argparse.ArgumentParser) -> None:
         default="code",
         help="objects built in code, or downloaded for ManiSkill (default: %(default)s)",
     )
+
+
+def add_level(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--level",
+        choices=tuple(LEVELS),
+        default=PAPER.name,
+        help="difficulty of the scenes: as in the paper, or with camera noise, rotated objects, distractors, "
+        "other tables and light, hidden parts and start poses (default: %(default)s)",
+    )
+
+
+def data_folder(assets: str, level: str, demo_set: int = 0) -> Path:
+    """Where demonstrations with these objects at this level are kept, those of one set apart from those of others."""
+    unusual = [value for value, usual in ((assets, "code"), (level, PAPER.name)) if value != usual]
+    return DATA.joinpath(*unusual, *([f"set-{demo_set}"] if demo_set else []))
 
 
 def add_method(parser: argparse.ArgumentParser) -> None:

@@ -31,9 +31,10 @@ class Variant:
     the configuration that these make: the one of `CONFIGS` that is nearest, with what differs; it is never given;
     ``model`` names the language model; ``steps`` is how long a method is trained; ``deadline_s`` bounds the
     sampling for one plan; ``code`` is the `code_digest` of the package, which stands for every setting that has no
-    name here; ``demonstrations`` the digest of those that were shown. What a method does not use is always empty (a
-    number None), so that the same work is never done, nor counted, under two names; RIP with ν = ∞ is "rip-gauss".
-    Rows of versions that did not note a setting have it empty, too: unknown.
+    name here; ``demonstrations`` the digest of those that were shown, which are of the set ``demo_set`` (see
+    `scenes.first_demonstration_seed`). What a method does not use is always empty (a number None), so that the same
+    work is never done, nor counted, under two names; RIP with ν = ∞ is "rip-gauss". Rows of versions that did not note
+    a setting have it empty, too: unknown.
     """
 
     method: str
@@ -49,6 +50,7 @@ class Variant:
     deadline_s: float | None = None
     code: str = ""
     demonstrations: str = ""
+    demo_set: int = 0
     keypoints: str = "registration"
     column: str = "auto"
     estimator: str = "em"
@@ -98,6 +100,7 @@ class Variant:
             self.layout,
             self.estimator,
             "" if self.steps is None else f"{self.steps}steps",
+            f"set{self.demo_set}" if self.demo_set else "",
         )
         return "-".join(word for word in words if word)
 
@@ -190,16 +193,19 @@ def require_no_path(*names: str) -> None:
 class Scene:
     """A drawn scene of ``task``, with ``objects`` that are "seen" in the demonstrations or "unseen".
 
-    ``assets`` is where their shapes come from: built in "code", or "maniskill"'s downloads.
+    ``assets`` is where their shapes come from: built in "code", or "maniskill"'s downloads; ``level`` is "paper" or
+    "hard", see `tasks.level.Level`.
     """
 
     task: str
     objects: str
     seed: int
     assets: str = "code"
+    level: str = "paper"
 
     def __post_init__(self) -> None:
-        require_no_path(self.task, self.objects, self.assets)
+        require_no_path(self.task, self.objects, self.assets, self.level)
 
     def __str__(self) -> str:
-        return f"{self.task}-{self.objects}-{self.seed}" + ("" if self.assets == "code" else f"-{self.assets}")
+        unusual = [value for value, usual in ((self.assets, "code"), (self.level, "paper")) if value != usual]
+        return "-".join((self.task, self.objects, str(self.seed), *unusual))

@@ -13,6 +13,7 @@ from robust_instant_policy.evaluation.variant import PAPER_CONFIGS
 from robust_instant_policy.files import read_regular
 from robust_instant_policy.reporting.pages import data_uri, render
 from robust_instant_policy.reporting.tables import Table
+from robust_instant_policy.tasks.level import PAPER
 
 TITLES = {
     "chosen": "Success rates",
@@ -45,11 +46,12 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class Section:
-    """One suite in one configuration: its name, the ``config``, the ``kinds`` of its objects where they are not the
-    usual ones, its figure as SVG and its tables.
+    """One suite in one configuration: its name and level, the ``config``, the ``kinds`` of its objects where they are
+    not the level's usual ones, its figure as SVG and its tables.
     """
 
     name: str
+    level: str
     config: str
     kinds: tuple[str, ...]
     figure: bytes
@@ -58,12 +60,14 @@ class Section:
     @property
     def title(self) -> str:
         config = f", configuration: {self.config}" if self.config else ""
-        return TITLES[self.name] + config + (f" ({', '.join(self.kinds)} objects)" if self.kinds else "")
+        level = "" if self.level == PAPER.name else f", {self.level} scenes"
+        return TITLES[self.name] + config + level + (f" ({', '.join(self.kinds)} objects)" if self.kinds else "")
 
     @property
     def anchor(self) -> str:
         config = re.sub(r"[^\w.-]+", "-", self.config)
-        return "-".join(word for word in (self.name, config, *self.kinds) if word)
+        level = "" if self.level == PAPER.name else self.level
+        return "-".join(word for word in (self.name, config, level, *self.kinds) if word)
 
     @property
     def image(self) -> str:
