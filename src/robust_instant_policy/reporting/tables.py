@@ -178,9 +178,10 @@ def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> T
     return Table(
         ("method", "executions", "failed", *(f"{stage} off" for stage in stages_met), "not examined"),
         tuple(rows),
-        "Each failure is attributed to the first stage that explains it when stages are replaced by the truth in this "
-        "order: execution (the demonstrator's own trajectory fails), keypoints (the method succeeds with the true ones), "
-        "regression (one of its candidates succeeds alone), else samples. A closed-loop policy has no such stages.",
+        "Each failure is attributed to the first stage that explains it when stages are replaced by the truth in "
+        "this order: execution (the demonstrator's own trajectory fails), keypoints (the method succeeds with the true "
+        "ones), regression (one of its candidates succeeds alone), else samples. A closed-loop policy has no such "
+        "stages.",
     )
 
 
