@@ -36,10 +36,10 @@ CAPTIONS = {
 }
 TOLD = " Black lines: the paper's own numbers, with other scenes and GPT-4o; for ALOHA's tasks, of a physical robot."
 CAUSES = {
-    "execution": "execution: even the demonstrator's own trajectory fails when it is replayed",
+    "execution": "execution: the demonstrator's own trajectory fails, too, when it is replayed",
     "keypoints": "keypoints: with the true keypoints the method succeeds",
-    "samples": "samples: no candidate succeeds, or a single sample was executed as it was",
-    "regression": "regression: one of its candidates succeeds by itself",
+    "samples": "samples: no candidate succeeds, or a single sample was executed",
+    "regression": "regression: one of its candidates succeeds alone",
     "policy": "policy: the demonstrator's trajectory succeeds when it is replayed",
 }
 
@@ -80,7 +80,7 @@ class Section:
 
 @dataclass(frozen=True)
 class FailedEpisode:
-    """What the page says of one; ``video`` is a data URL, or empty where there is none."""
+    """A failed episode on the page; ``video`` is a data URL, empty if there is no video."""
 
     outcome: str
     cause: str

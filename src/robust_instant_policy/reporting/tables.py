@@ -192,10 +192,10 @@ def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> T
     return Table(
         ("method", "executions", "failed", *(f"{stage} off" for stage in stages_met), "not examined"),
         tuple(rows),
-        "Each failed episode is laid at the first stage that is to blame when parts are replaced by the truth, one by "
-        "one: execution (the demonstrator's own trajectory, played back, fails), keypoints (with the true ones it "
-        "succeeds), regression (one of its candidates succeeds by itself), else samples. A closed-loop policy has no "
-        "such stages.",
+        "Each failure is attributed to the first stage that explains it when stages are replaced by the truth in "
+        "this order: execution (the demonstrator's own trajectory fails), keypoints (the method succeeds with the true "
+        "ones), regression (one of its candidates succeeds alone), else samples. A closed-loop policy has no such "
+        "stages.",
     )
 
 
