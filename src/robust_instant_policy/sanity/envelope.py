@@ -25,8 +25,8 @@ DEGREES = 180 / np.pi  # in a radian
 class Envelope:
     """Limits of a plan's numbers, margins included; A arms.
 
-    ``lower`` and ``upper (A, 3)``: corners of the box that holds palm and fingertips, metres, world; ``lowest (A,)``
-    height of a fingertip above the table, metres; ``step (A,)`` metres and ``turn (A,)`` rad from one step to the
+    ``lower`` and ``upper (A, 3)``: corners of the box that holds gripper point and fingertips, metres, world;
+    ``lowest (A,)`` height of a fingertip above the table, metres; ``step (A,)`` metres and ``turn (A,)`` rad from one step to the
     next, of ``steps`` steps; ``approach (A, 3)`` mean direction and ``tilt (A,)`` rad around it; ``sides (A, 3)`` of
     the gripper's triangle, metres; ``length (A,)`` of the path, metres; ``changes`` the sequences of gripper states,
     one for each arm, that were demonstrated.
@@ -130,7 +130,7 @@ class Envelope:
         if off.max() > 0:
             step, side = (int(i) for i in np.unravel_index(int(off.argmax()), off.shape))
             value, usual = sides[step, side], self.sides[arm, side]
-            what = "between the fingertips" if side == 0 else "between palm and fingertip"
+            what = "between the fingertips" if side == 0 else "between gripper point and fingertip"
             words = f"the gripper is {value * 1e3:.0f} mm {what} at step {step}, {usual * 1e3:.0f} mm demonstrated"
             found.append(_outside("gripper shape", name + words, value, usual, step))
         if (total := lengths.sum()) > (limit := self.length[arm]):
@@ -145,7 +145,7 @@ def step_lengths(trajectory: Trajectory) -> FloatArray:
 
 
 def approaches(trajectory: Trajectory) -> FloatArray:
-    """Unit vectors ``(T, A, 3)`` from the palm to the middle of the fingertips; zero where they coincide."""
+    """Unit vectors ``(T, A, 3)`` from the gripper point to the middle of the fingertips; zero where they coincide."""
     forward = trajectory.triplets[:, :, 1:].mean(axis=2) - trajectory.triplets[:, :, 0]
     return forward / np.maximum(np.linalg.norm(forward, axis=-1, keepdims=True), 1e-9)
 
@@ -162,9 +162,9 @@ def step_turns(trajectory: Trajectory) -> FloatArray:
 
 
 def triangle_sides(points: FloatArray) -> FloatArray:
-    """Lengths ``(..., 3)`` of fingertip to fingertip and palm to each fingertip, of ``points (..., 3, 3)``."""
-    palm, left, right = points[..., 0, :], points[..., 1, :], points[..., 2, :]
-    return np.stack([np.linalg.norm(d, axis=-1) for d in (left - right, left - palm, right - palm)], axis=-1)
+    """Lengths ``(..., 3)`` of fingertip to fingertip and gripper point to each fingertip, of ``points (..., 3, 3)``."""
+    gripper, left, right = points[..., 0, :], points[..., 1, :], points[..., 2, :]
+    return np.stack([np.linalg.norm(d, axis=-1) for d in (left - right, left - gripper, right - gripper)], axis=-1)
 
 
 def gripper_changes(trajectory: Trajectory) -> tuple[tuple[int, ...], ...]:

@@ -29,7 +29,7 @@ from robust_instant_policy.sanity.view import View
 
 OWN_BETTER = 0.2  # by which the own images' consistency must exceed that of other images
 CLOSE_M = 0.015  # gap from which a path is compared with other hypotheses, too
-LOWEST_PALM_M = 0.02  # above the table
+LOWEST_GRIPPER_POINT_M = 0.02  # above the table
 MOSTLY = 0.8  # share of the demonstrations
 ONE_SCENE_M = 0.01  # spread of the objects below which all demonstrations show one scene
 UNLIKE = 0.25  # likeness below which a demonstration contradicts the others,
@@ -106,9 +106,9 @@ def _measured(as_is: Evidence) -> str:
     if not as_is.is_clear:
         buried = float(np.median([c.buried for c in as_is.contacts]))
         if buried < BURIED_M:
-            lowest = float(np.median([min(c.lowest, c.lowest_palm) for c in as_is.contacts]))
+            lowest = float(np.median([min(c.lowest, c.lowest_gripper_point) for c in as_is.contacts]))
             return f"the gripper reaches {-lowest * 1e3:.0f} mm below the table that the images show"
-        return f"the palm passes {buried * 1e3:.0f} mm deep through what the images show"
+        return f"the gripper point passes {buried * 1e3:.0f} mm deep through what the images show"
     if as_is.touching < MIN_SHARE:
         if np.isfinite(as_is.grasp_gap) and as_is.grasp_gap > TOUCH_M:
             grasps = f"grasp points lie {as_is.grasp_gap:.2f} m from any surface"
@@ -131,14 +131,14 @@ def _explained(explanation: Explanation) -> str:
     return f"{words}: {explanation.remedy}"
 
 
-def check_palms(as_is: Evidence) -> list[Finding]:
-    """A palm that touches the table belongs to a tool frame whose axes or offset are wrong."""
-    lowest = float(np.median([c.lowest_palm for c in as_is.contacts]))
-    if lowest > LOWEST_PALM_M:
+def check_gripper_points(as_is: Evidence) -> list[Finding]:
+    """A gripper point that touches the table belongs to a tool frame whose axes or offset are wrong."""
+    lowest = float(np.median([c.lowest_gripper_point for c in as_is.contacts]))
+    if lowest > LOWEST_GRIPPER_POINT_M:
         return []
-    words = f"the palm comes within {lowest * 1e3:.0f} mm of the table: the gripper lies on its side or upside down"
-    advice = "; check the tool frame (z out of the gripper) and the order of quaternions"
-    return [Finding("rotation", "warning", words + advice, {"lowest_palm": lowest}, "tool frame")]
+    words = f"the gripper point comes within {lowest * 1e3:.0f} mm of the table: the gripper lies on its side"
+    advice = " or upside down; check the tool frame (z out of the gripper) and the order of quaternions"
+    return [Finding("rotation", "warning", words + advice, {"lowest_gripper_point": lowest}, "tool frame")]
 
 
 def check_openings(demonstrations: Sequence[Demonstration], views: Sequence[View]) -> list[Finding]:

@@ -21,8 +21,8 @@ from robust_instant_policy.sanity.image import check_each_image, check_image
 from robust_instant_policy.sanity.images import (
     ONE_SCENE_M,
     check_contact,
+    check_gripper_points,
     check_openings,
-    check_palms,
     check_quaternions,
     scene_spread,
 )
@@ -125,7 +125,7 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
     found += cameras
     found += check_contact(demonstrations, views, paths, poses, as_is)
     edges = [agreement(view) for view in views]
-    found += check_palms(as_is) + check_openings(demonstrations, views)
+    found += check_gripper_points(as_is) + check_openings(demonstrations, views)
     found += check_agreement(views, edges)
     spread = scene_spread(views)
     if len(views) > 1 and np.isfinite(spread) and spread < ONE_SCENE_M:
