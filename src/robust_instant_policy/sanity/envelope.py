@@ -26,10 +26,10 @@ class Envelope:
     """Limits of a plan's numbers, margins included; A arms.
 
     ``lower`` and ``upper (A, 3)``: corners of the box that holds gripper point and fingertips, metres, world;
-    ``lowest (A,)`` height of a fingertip above the table, metres; ``step (A,)`` metres and ``turn (A,)`` rad from one step to the
-    next, of ``steps`` steps; ``approach (A, 3)`` mean direction and ``tilt (A,)`` rad around it; ``sides (A, 3)`` of
-    the gripper's triangle, metres; ``length (A,)`` of the path, metres; ``changes`` the sequences of gripper states,
-    one for each arm, that were demonstrated.
+    ``lowest (A,)`` height of a fingertip above the table, metres; ``step (A,)`` metres and ``turn (A,)`` rad from
+    one step to the next, of ``steps`` steps; ``approach (A, 3)`` mean direction and ``tilt (A,)`` rad around it;
+    ``sides (A, 3)`` of the gripper's triangle, metres; ``length (A,)`` of the path, metres; ``changes`` the
+    sequences of gripper states, one for each arm, that were demonstrated.
     """
 
     lower: FloatArray
