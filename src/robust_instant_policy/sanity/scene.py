@@ -109,10 +109,8 @@ def _picture_changed(
                     "scenery", "error", f"{words}; with {cause} it agrees: {hypothesis.remedy}", numbers, cause
                 )
         words = f"depth reads {like.ratio:.3g} times the demonstrations' ({like.offset * 100:+.1f} cm)"
-        advice = (
-            "; check the depth unit and calibration, and whether the camera was moved towards or away from the table"
-        )
-        return Finding("scenery", "error", words + advice, numbers, "depth scale, or camera moved")
+        advice = "; the table is lower or higher, the camera was moved, or the depth is not calibrated"
+        return Finding("scenery", "error", words + advice, numbers, "depth scale, camera or table moved")
     if moved:
         cols, rows = moved
         metres = float(np.hypot(cols, rows) * np.nanmedian(view.depth) / view.observation.intrinsics[0, 0])
@@ -168,5 +166,5 @@ def check_table(view: View, plane: FloatArray, centre: FloatArray) -> list[Findi
         f"turned by {np.rad2deg(angle):.1f} degrees"
     )
     numbers = {"table_offset": offset, "table_angle": angle}
-    advice = "; the camera's pose or the depth is wrong"
+    advice = "; the camera's pose or the depth is wrong, or the table was moved"
     return [Finding("table", "error", words + advice, numbers, "camera pose or depth: the table moved")]
