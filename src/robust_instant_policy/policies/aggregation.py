@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.errors import InvalidValueError, PlanningError
-from robust_instant_policy.policies.confidence import UNKNOWN_NOTE, Evidence, novelty, plan_confidence
+from robust_instant_policy.policies.confidence import UNKNOWN_NOTE, Evidence, distortion, novelty, plan_confidence
 from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.policy import Plan, Stage, Stopwatch, Usage
 from robust_instant_policy.policies.sampling import Proposal
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.regression import RobustTrajectory, robust_gripper_trajectory
+from robust_instant_policy.sanity import errors
 from robust_instant_policy.trajectory import Trajectory
 
 
@@ -81,12 +82,17 @@ def make_plan(
     """
     trajectory = Trajectory(chosen.actions, chosen.times)
     outside = context.report.envelope.check(trajectory) if context.report.envelope is not None else ()
-    evidence = Evidence.of(
-        chosen.confidence,
-        scene.located.confidence,
-        context.prediction_errors,
-        novelty(context.keypoints, scene.keypoints),
-        (*context.report.findings, *scene.findings, *outside),
+    findings = (*context.report.findings, *scene.findings, *outside)
+    evidence = Evidence(
+        agreement=chosen.confidence,
+        keypoints=float(np.quantile(scene.located.confidence, 0.25)),
+        distortion=distortion(context.keypoints, scene.keypoints),
+        prediction=float(np.median(context.prediction_errors.max(axis=1))),
+        novelty=novelty(context.keypoints, scene.keypoints),
+        displacement=context.surroundings.displacement(scene.view, chosen.actions) if scene.view else float("nan"),
+        precision=context.surroundings.precision,
+        warnings=sum(finding.severity == "warning" for finding in findings),
+        errors=len(errors(findings)),
     )
     unknown = (UNKNOWN_NOTE,) if judged and not evidence.is_known else ()
     return Plan(
