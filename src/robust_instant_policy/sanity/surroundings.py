@@ -30,7 +30,8 @@ OUTLIER = 9.0  # squared deviations, of a cell, that count at most
 MIN_KNOWN = 0.5  # share of a map's cells that must be known
 EVERY = 3  # steps from one moment that is tried to the next
 MIN_VARIATION_M = 0.01  # of the gripper's place over the demonstrations; a common home says nothing
-USUALLY = 0.8  # quantile over the demonstrations
+USUALLY = 0.75  # quantile over the demonstrations
+UNKNOWN_M = 0.1  # as which a displacement counts that is not known
 MOMENTS = 3  # that are kept for each arm
 MIN_DEMONSTRATIONS = 3
 
@@ -107,7 +108,7 @@ class _Surface:
         places = ((left + right) / 2)[:2] + _GRID @ axes
         distance, nearest = self.tree.query(places.reshape(-1, 2))
         values = np.where((distance < 1.5 * CELL_M)[:, None], self.values[nearest], np.nan)
-        return values.reshape(*places.shape[:2], -1)
+        return values.reshape(*places.shape[:2], -1).astype(np.float32)
 
 
 def _best_moments(surfaces: Sequence[_Surface], actions: FloatArray, arm: int) -> tuple[Moment, ...]:
@@ -124,10 +125,10 @@ def _best_moments(surfaces: Sequence[_Surface], actions: FloatArray, arm: int) -
             shifts = [
                 shift(one, *_usual(np.delete(maps, index, axis=0)[:, _INNER, _INNER])) for index, one in enumerate(maps)
             ]
-            usual = np.nan_to_num(shifts, nan=np.inf)
-            precision = float(np.quantile(usual, USUALLY, method="higher"))
+            usual = np.nan_to_num(shifts, nan=UNKNOWN_M)
+            precision = float(np.quantile(usual, USUALLY))
             found.append(((precision, float(np.mean(usual))), step, turned, maps))
-    found = [one for one in found if np.isfinite(one[0][0])]
+    found = [one for one in found if one[0][0] < UNKNOWN_M]
     found.sort(key=lambda one: one[0])
     return tuple(
         Moment(int(step), arm, turned, *_usual(maps[:, _INNER, _INNER]), precision)
@@ -156,7 +157,8 @@ def shift(found: FloatArray, mean: FloatArray, deviation: FloatArray) -> float:
     The squared deviations, cut off at `OUTLIER`, are averaged over the cells that are known. NaN where these are few.
     """
     windows = sliding_window_view(found, mean.shape[:2], axis=(0, 1))  # (k, k, 4, m, m)
-    squares = ((windows - np.moveaxis(mean, -1, 0)) / np.moveaxis(deviation, -1, 0)) ** 2
+    middle, weight = (np.moveaxis(values, -1, 0).astype(np.float32) for values in (mean, 1 / deviation))
+    squares = ((windows - middle) * weight) ** 2
     known = np.isfinite(squares)
     share = known.mean(axis=(2, 3, 4))
     if share[REACH_CELLS, REACH_CELLS] < MIN_KNOWN:
