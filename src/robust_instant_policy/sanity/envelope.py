@@ -17,6 +17,7 @@ STEP_FACTOR, STEP_MARGIN_M = 1.5, 0.05  # on the longest demonstrated step
 TURN_FACTOR, TURN_MARGIN_RAD = 1.5, np.deg2rad(25.0)  # on the largest demonstrated turn of a step
 TILT_MARGIN_RAD = np.deg2rad(25.0)  # on how far the approach leaned away from its mean direction
 SIDE_FACTOR, SIDE_MARGIN_M = 0.15, 0.005  # on the sides of the gripper's triangle
+FEW = 2.0  # by which margins widen, over the number of demonstrations less one
 LENGTH_FACTOR = 2.0  # on the longest demonstrated path
 DEGREES = 180 / np.pi  # in a radian
 
@@ -25,15 +26,16 @@ DEGREES = 180 / np.pi  # in a radian
 class Envelope:
     """Limits of a plan's numbers, margins included; A arms.
 
-    ``lower`` and ``upper (A, 3)``: corners of the box that holds gripper point and fingertips, metres, world;
-    ``lowest (A,)`` height of a fingertip above the table, metres; ``step (A,)`` metres and ``turn (A,)`` rad from
-    one step to the next, of ``steps`` steps; ``approach (A, 3)`` mean direction and ``tilt (A,)`` rad around it;
-    ``sides (A, 3)`` of the gripper's triangle, metres; ``length (A,)`` of the path, metres; ``changes`` the
-    sequences of gripper states, one for each arm, that were demonstrated.
+    ``lower`` and ``upper (A, 3)``: corners of the box that holds gripper point and fingertips, metres, world, with
+    the ``margin``, metres; ``lowest (A,)`` height of a fingertip above the table, metres; ``step (A,)`` metres and
+    ``turn (A,)`` rad from one step to the next, of ``steps`` steps; ``approach (A, 3)`` mean direction and ``tilt
+    (A,)`` rad around it; ``sides (A, 3)`` of the gripper's triangle, metres; ``length (A,)`` of the path, metres;
+    ``changes`` the sequences of gripper states, one for each arm, that were demonstrated.
     """
 
     lower: FloatArray
     upper: FloatArray
+    margin: float
     lowest: FloatArray
     step: FloatArray
     turn: FloatArray
@@ -47,7 +49,11 @@ class Envelope:
 
     @classmethod
     def of(cls, trajectories: Sequence[Trajectory], plane: FloatArray) -> Envelope:
-        """Of demonstrated ``trajectories`` with the same number of arms, over the table's ``plane (4,)``."""
+        """Of demonstrated ``trajectories`` with the same number of arms, over the table's ``plane (4,)``.
+
+        The extremes of few demonstrations bound a new one less: margins that protect nothing but plausibility widen by
+        1 + 2 / (I - 1), those of height and of the gripper's shape do not.
+        """
         thinned = [downsample(trajectory) for trajectory in trajectories]
         points = np.concatenate([trajectory.triplets for trajectory in trajectories])  # (T, A, 3, 3)
         directions = np.concatenate([approaches(trajectory) for trajectory in trajectories])
@@ -57,14 +63,16 @@ class Envelope:
         heights = points[:, :, 1:] @ plane[:3] + plane[3]
         steps = np.array([_largest(step_lengths(t)) for t in thinned]).max(axis=0)
         turns = np.array([_largest(step_turns(t)) for t in thinned]).max(axis=0)
+        wider = 1 + FEW / max(len(trajectories) - 1, 1)
         return cls(
-            lower=points.min(axis=(0, 2)) - POSITION_MARGIN_M,
-            upper=points.max(axis=(0, 2)) + POSITION_MARGIN_M,
+            lower=points.min(axis=(0, 2)) - wider * POSITION_MARGIN_M,
+            upper=points.max(axis=(0, 2)) + wider * POSITION_MARGIN_M,
+            margin=wider * POSITION_MARGIN_M,
             lowest=heights.min(axis=(0, 2)) - HEIGHT_MARGIN_M,
-            step=STEP_FACTOR * steps + STEP_MARGIN_M,
-            turn=TURN_FACTOR * turns + TURN_MARGIN_RAD,
+            step=steps + wider * ((STEP_FACTOR - 1) * steps + STEP_MARGIN_M),
+            turn=turns + wider * ((TURN_FACTOR - 1) * turns + TURN_MARGIN_RAD),
             approach=mean,
-            tilt=leaning + TILT_MARGIN_RAD,
+            tilt=leaning + wider * TILT_MARGIN_RAD,
             sides=np.median(triangle_sides(points), axis=0),
             length=LENGTH_FACTOR * np.array([step_lengths(t).sum(axis=0) for t in thinned]).max(axis=0),
             steps=max(len(t) for t in thinned),
@@ -107,9 +115,9 @@ class Envelope:
                 told = words.format(step=step, next=step + 1, value=unit * values[step], limit=unit * limit)
                 found.append(_outside(kind, name + told, values[step], limit, step))
 
-        outside = np.maximum(self.lower[arm] - points, points - self.upper[arm]).max(axis=(1, 2)) + POSITION_MARGIN_M
+        outside = np.maximum(self.lower[arm] - points, points - self.upper[arm]).max(axis=(1, 2)) + self.margin
         words = "position of step {step} lies {value:.2f} m outside what was demonstrated, {limit:.2f} m allowed"
-        bound("position", outside, POSITION_MARGIN_M, words)
+        bound("position", outside, self.margin, words)
         heights, lowest = (points[:, 1:] @ self.plane[:3] + self.plane[3]).min(axis=1), self.lowest[arm]
         if heights.min() < lowest:
             step = int(heights.argmin())

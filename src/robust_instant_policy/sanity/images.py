@@ -34,6 +34,8 @@ MOSTLY = 0.8  # share of the demonstrations
 ONE_SCENE_M = 0.01  # spread of the objects below which all demonstrations show one scene
 SAME_PLACE_M = 0.02  # largest distance between positions that are called one place
 ALONG_FINGERS = np.linspace(-0.5, 1.5, 41)  # points of the line through the fingertips, these at 0 and 1
+REACHED_M = 0.05  # the last part of the way to a grasp
+SIDEWAYS_RAD = np.deg2rad(70.0)  # to the approach axis, in which no grasp of the simulated tasks is reached
 UNLIKE = 0.25  # likeness below which a demonstration contradicts the others,
 ALIKE = 0.6  # where their median is at least this
 FAR_FROM_ALL_M = 0.06  # gap of a path that alone touches nothing
@@ -133,14 +135,41 @@ def _explained(explanation: Explanation) -> str:
     return f"{words}: {explanation.remedy}"
 
 
-def check_gripper_points(as_is: Evidence) -> list[Finding]:
-    """A gripper point that touches the table belongs to a tool frame whose axes or offset are wrong."""
-    lowest = _lowest_gripper_point(as_is)
-    if lowest > LOWEST_GRIPPER_POINT_M:
+def check_tool_frame(demonstrations: Sequence[Demonstration], views: Sequence[View], as_is: Evidence) -> list[Finding]:
+    """A gripper point that touches the table, or grippers that reach what they grasp sideways, belong to a tool frame
+    whose axes or offset are wrong."""
+    numbers, words = {}, []
+    if (lowest := _lowest_gripper_point(as_is)) <= LOWEST_GRIPPER_POINT_M:
+        numbers["lowest_gripper_point"] = lowest
+        words.append(f"the gripper point comes within {lowest * 1e3:.0f} mm of the table")
+    sideways = [angle for d, view in zip(demonstrations, views, strict=True) for angle in _reaching_angles(d, view)]
+    if len(sideways) >= MIN_SHARE * len(views) and (angle := float(np.median(sideways))) > SIDEWAYS_RAD:
+        numbers["sideways"] = angle
+        words.append(f"grippers reach what they grasp at {np.rad2deg(angle):.0f} degrees to their approach axis")
+    if not words:
         return []
-    words = f"the gripper point comes within {lowest * 1e3:.0f} mm of the table: the gripper lies on its side"
-    advice = " or upside down; check the tool frame (z out of the gripper) and the order of quaternions"
-    return [Finding("rotation", "warning", words + advice, {"lowest_gripper_point": lowest}, "tool frame")]
+    advice = ": the gripper lies on its side; check the tool frame (z out of the gripper) and how rotations are written"
+    return [Finding("rotation", "warning", " and ".join(words) + advice, numbers, "tool frame")]
+
+
+def _reaching_angles(demonstration: Demonstration, view: View) -> list[float]:
+    """Angle, rad, between the last `REACHED_M` of the way to each grasp and the gripper's approach axis there."""
+    trajectory = demonstration.trajectory
+    closed = trajectory.gripper_state > 0.5
+    middles, forward = trajectory.triplets[:, :, 1:].mean(axis=2), approaches(trajectory)
+    found = []
+    for step, arm in np.argwhere(closed[1:] & ~closed[:-1]) + np.array([1, 0]):
+        way = middles[step, arm] - middles[:step, arm]
+        before = np.flatnonzero(np.linalg.norm(way, axis=1) > REACHED_M)
+        if len(before) and _gap(view, middles[step, arm]) < touch_distance(view):
+            last = way[before[-1]]
+            found.append(float(np.arccos(np.clip(last @ forward[step, arm] / np.linalg.norm(last), -1, 1))))
+    return found
+
+
+def _gap(view: View, point: FloatArray) -> float:
+    """From ``point (3,)`` to the table or to what stands on it, metres."""
+    return min(float(gaps(view, point[None])[0]), float(view.above_plane(point)))
 
 
 def _lowest_gripper_point(as_is: Evidence) -> float:
@@ -149,31 +178,20 @@ def _lowest_gripper_point(as_is: Evidence) -> float:
 
 
 def check_openings(demonstrations: Sequence[Demonstration], views: Sequence[View]) -> list[Finding]:
-    """Grippers that begin closed and open at something to grasp, or open for nothing, may have inverted states."""
-    at_surface = for_nothing = 0
+    """Grippers that begin closed, and open at something to grasp or for nothing, may have inverted states."""
+    inverted = 0
     for demonstration, view in zip(demonstrations, views, strict=True):
         closed = demonstration.trajectory.gripper_state[:, 0] > 0.5
         if not closed[0] or closed.all():
             continue
         first = int((~closed).argmax())
         middle = demonstration.trajectory.triplets[first, 0, 1:].mean(axis=0)
-        if gaps(view, middle[None])[0] < touch_distance(view):
-            at_surface += 1
-        elif not closed[first:].any():
-            for_nothing += 1
-    told = {"opens at a surface": at_surface, "opens where nothing is, and closes no more": for_nothing}
-    return [
-        Finding(
-            "gripper state",
-            "warning",
-            f"in {count} of {len(views)} demonstrations the gripper begins closed and {words}: are its states "
-            "inverted? 0 is open, 1 is closed",
-            {"inverted": float(count)},
-            "states inverted",
-        )
-        for words, count in told.items()
-        if count >= MOSTLY * len(views)
-    ]
+        inverted += bool(_gap(view, middle) < touch_distance(view) or not closed[first:].any())
+    if inverted < MOSTLY * len(views):
+        return []
+    words = f"in {inverted} of {len(views)} demonstrations the gripper begins closed and opens at a surface"
+    advice = ", or for nothing: are its states inverted? 0 is open, 1 is closed"
+    return [Finding("gripper state", "warning", words + advice, {"inverted": float(inverted)}, "states inverted")]
 
 
 def check_fingers(demonstrations: Sequence[Demonstration], views: Sequence[View]) -> list[Finding]:
@@ -261,7 +279,7 @@ def check_rotations(demonstrations: Sequence[Demonstration], as_is: Evidence) ->
     for words, other in rotations_read_otherwise(triplets):
         forward = other[:, 1:].mean(axis=1) - other[:, 0]
         forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-        if (then := _spread(forward)) < STRAIGHT_RAD and (now >= CROOKED_RAD or forward[:, 2].mean() < 0):
+        if (then := _spread(forward)) < STRAIGHT_RAD and (now >= CROOKED_RAD or words.startswith("Euler")):
             message = (
                 f"grippers lean by {np.rad2deg(now):.0f} degrees from their mean approach; with {words} all approach "
                 f"within {np.rad2deg(then):.1f} degrees: check how the rotation's numbers are written"

@@ -23,9 +23,9 @@ from robust_instant_policy.sanity.images import (
     check_contact,
     check_direction,
     check_fingers,
-    check_gripper_points,
     check_openings,
     check_rotations,
+    check_tool_frame,
     scene_spread,
 )
 from robust_instant_policy.sanity.scene import TABLE_M, check_against_scenery, check_table
@@ -126,7 +126,7 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
     found += cameras + check_rotations(demonstrations, as_is)
     found += check_contact(demonstrations, views, paths, poses, as_is)
     edges = [agreement(view) for view in views]
-    found += check_gripper_points(as_is) + check_openings(demonstrations, views)
+    found += check_tool_frame(demonstrations, views, as_is) + check_openings(demonstrations, views)
     found += check_fingers(demonstrations, views) + check_direction(demonstrations, views)
     found += check_agreement(views, edges)
     spread = scene_spread(views)
