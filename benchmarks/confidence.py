@@ -38,7 +38,7 @@ from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import KeypointError, PlanningError, RipError
 from robust_instant_policy.evaluation.statistics import wilson_interval
 from robust_instant_policy.policies import RobustInstantPolicy
-from robust_instant_policy.policies.confidence import COEFFICIENTS, Evidence, plan_confidence
+from robust_instant_policy.policies.confidence import COEFFICIENTS, GOOD_AGREEMENT, Evidence, plan_confidence
 from robust_instant_policy.policies.context import locate
 from robust_instant_policy.sanity import SetReport, errors
 from robust_instant_policy.tasks import TASK_NAMES, make_task
@@ -50,7 +50,7 @@ SPLITS = {"tune": (700_000, 710_000), "test": (720_000, 730_000)}  # first seeds
 HALLUCINATED = {"hallucinated-40%": 0.4, "hallucinated-60%": 0.6, "hallucinated-80%": 0.8}  # of the candidates
 NUM_DEMOS = 10
 GATE = 0.9
-PRIOR_WEIGHT = 2.0  # of a coefficient's squared distance from 1, in units of the log-likelihood
+PRIOR_WEIGHT = 0.5  # of a coefficient's squared distance from 1, in units of the log-likelihood
 NAMES = [field.name for field in fields(Evidence)]
 REFUSALS = (KeypointError, PlanningError)
 Row = dict[str, Any]
@@ -201,6 +201,7 @@ def fit(options: argparse.Namespace) -> None:
     The prior decides where rows do not: most faults are refused, so few plans are wrong. Each task is then left out.
     """
     rows = [row for row in executed(all_rows(options.folder, "tune")) if not row["evidence"]["errors"]]
+    rows = [row for row in rows if row["evidence"]["agreement"] >= GOOD_AGREEMENT]  # the other factor of the model
     names = [name for name in COEFFICIENTS if name != "constant"]
     found = [evidence_of(row).features() for row in rows]
     features = np.array([[1.0, *(values[name] for name in names)] for values in found])

@@ -154,12 +154,12 @@ def test_a_setting_that_makes_no_sense_is_refused_where_it_is_given(options):
 
 SURE = Evidence(
     agreement=0.9,
-    keypoints=0.8,
     distortion=0.5,
     prediction=0.008,
     novelty=0.4,
     displacement=0.004,
     precision=0.004,
+    doubts=0,
     warnings=0,
     errors=0,
 )
@@ -169,12 +169,12 @@ SURE = Evidence(
     "worse",
     [
         {"agreement": 0.1},
-        {"keypoints": 0.3},
         {"distortion": 5.0},
         {"prediction": 0.05},
         {"novelty": 4.0},
         {"displacement": 0.04},
         {"precision": 0.04},
+        {"doubts": 1},
         {"warnings": 2},
     ],
     ids=lambda worse: next(iter(worse)),

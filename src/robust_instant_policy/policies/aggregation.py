@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.errors import InvalidValueError, PlanningError
-from robust_instant_policy.policies.confidence import UNKNOWN_NOTE, Evidence, distortion, novelty, plan_confidence
+from robust_instant_policy.policies.confidence import (
+    UNKNOWN_NOTE,
+    Evidence,
+    distortion,
+    doubts,
+    novelty,
+    plan_confidence,
+    prediction,
+)
 from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.policy import Plan, Stage, Stopwatch, Usage
 from robust_instant_policy.policies.sampling import Proposal
@@ -85,16 +93,17 @@ def make_plan(
     findings = (*context.report.findings, *scene.findings, *outside)
     evidence = Evidence(
         agreement=chosen.confidence,
-        keypoints=float(np.quantile(scene.located.confidence, 0.25)),
         distortion=distortion(context.keypoints, scene.keypoints),
-        prediction=float(np.median(context.prediction_errors.max(axis=1))),
+        prediction=prediction(context.prediction_errors),
         novelty=novelty(context.keypoints, scene.keypoints),
         displacement=context.surroundings.displacement(scene.view, chosen.actions) if scene.view else float("nan"),
         precision=context.surroundings.precision,
-        warnings=sum(finding.severity == "warning" for finding in findings),
+        doubts=doubts(findings),
+        warnings=sum(finding.severity == "warning" for finding in findings) - doubts(findings),
         errors=len(errors(findings)),
     )
     unknown = (UNKNOWN_NOTE,) if judged and not evidence.is_known else ()
+    beside = (evidence.displacement_note,) if evidence.features()["displacement"] else ()
     return Plan(
         trajectory=trajectory,
         candidates=proposal.candidates,
@@ -109,5 +118,5 @@ def make_plan(
         pixels=scene.located.pixels,
         keypoint_confidence=scene.located.confidence,
         usage=Usage((scene.stage, *proposal.stages, *stages)),
-        notes=(*context.notes, *scene.notes, *proposal.notes, *map(str, outside), *unknown),
+        notes=(*context.notes, *scene.notes, *proposal.notes, *map(str, outside), *beside, *unknown),
     )

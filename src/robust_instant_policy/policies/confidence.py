@@ -10,14 +10,18 @@ most `UNKNOWN`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.sanity import Finding
 
-COEFFICIENTS = {"constant": 4.1, "keypoints": 0.93, "prediction": 0.53, "novelty": 0.85, "warnings": 0.66}
+COEFFICIENTS = {
+    "constant": 3.21, "distortion": 0.92, "prediction": 1.23, "novelty": 1.33, "displacement": 1.33, "precision": 1.8,
+    "doubts": 4.19, "warnings": 0.83,
+}  # fmt: skip
 UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
 
 UNKNOWN_NOTE = (
@@ -26,15 +30,17 @@ UNKNOWN_NOTE = (
 )
 
 RECOGNISED = 0.5  # confidence of keypoints from which on a scene counts as recognised; 0.7 to 0.8 is usual
-GOOD_KEYPOINTS = 0.8  # above which more says nothing
-GOOD_PREDICTION_M = 0.010  # below which demonstrations predict each other as well as keypoints are measured
-GOOD_PRECISION_M = 0.010  # below which the gripper's place repeats as well as images are measured
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
-LEAST = 1e-3  # of a ratio whose logarithm is taken
+# Up to these values evidence says nothing: sound scenes have them.
+GOOD_DISTORTION = 2.0
+GOOD_PREDICTION_M = 0.015
+GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT = 0.015, 1.5  # or that many times the demonstrations' own
+GOOD_PRECISION_M = 0.025
 LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one scene
 NOISE_M = 0.02  # variation of a coordinate below which it says nothing about a scene
 RIGID_M = 0.010  # variation of the distance of two keypoints below which they belong to one rigid thing
 DISTANCE_M = 0.003  # with which a distance between keypoints is measured
+RECORDING = {"gripper state", "grasp", "rotation"}  # kinds of findings
 MIN_SCENES = 3  # below which nothing is known of their variation
 
 
@@ -42,21 +48,21 @@ MIN_SCENES = 3  # below which nothing is known of their variation
 class Evidence:
     """What speaks for or against a plan. NaN is unknown.
 
-    ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``keypoints`` in [0, 1], the lower
-    quartile of their confidence; ``distortion`` of the distances between them (see `distortion`); ``prediction`` in
-    metres, the median over the demonstrations of the worst error with which the others predict one (`leave_one_out`);
-    ``novelty``, how far the scene lies from the demonstrations (see `novelty`); ``displacement``, metres, of the plan
-    against what lies around the gripper, and ``precision``, that of the demonstrations (`Surroundings`); ``warnings``
-    and ``errors``, how many findings of the checks there are.
+    ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``distortion`` of the distances between
+    keypoints (see `distortion`); ``prediction``, metres, the error with which demonstrations predict each other at the
+    key step at which they do so best (see `prediction`); ``novelty``, how far the scene lies from the demonstrations
+    (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and ``precision``, that
+    of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording (`doubts`), other
+    ``warnings``, and ``errors``.
     """
 
     agreement: float
-    keypoints: float
     distortion: float
     prediction: float
     novelty: float
     displacement: float
     precision: float
+    doubts: int
     warnings: int
     errors: int
 
@@ -65,20 +71,25 @@ class Evidence:
         """Whether the demonstrations tell how well they predict a new scene."""
         return bool(np.isfinite(self.prediction) and np.isfinite(self.novelty))
 
+    @property
+    def displacement_note(self) -> str:
+        return (
+            f"warning: around the planned gripper the image shows what lies {self.displacement * 1e3:.0f} mm beside it "
+            f"in the demonstrations (theirs differ by {self.precision * 1e3:.0f} mm): were the keypoints found rightly?"
+        )
+
     def features(self) -> Mapping[str, float]:
         """f_j by name; 0 for what is not known."""
         found = {
-            "keypoints": GOOD_KEYPOINTS / max(self.keypoints, LEAST),
-            "distortion": self.distortion,
+            "distortion": self.distortion / GOOD_DISTORTION,
             "prediction": self.prediction / GOOD_PREDICTION_M,
             "novelty": self.novelty,
-            "displacement": self.displacement / max(2 * self.precision, GOOD_PRECISION_M),
+            "displacement": self.displacement
+            / max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision))),
             "precision": self.precision / GOOD_PRECISION_M,
         }
-        return {
-            **{name: -float(np.log(max(ratio, 1.0))) if np.isfinite(ratio) else 0.0 for name, ratio in found.items()},
-            "warnings": -float(self.warnings),
-        }
+        ratios = {name: -float(np.log(max(ratio, 1.0))) for name, ratio in found.items() if np.isfinite(ratio)}
+        return {**dict.fromkeys(found, 0.0), **ratios, "doubts": -float(self.doubts), "warnings": -float(self.warnings)}
 
 
 def plan_confidence(evidence: Evidence) -> float:
@@ -88,6 +99,21 @@ def plan_confidence(evidence: Evidence) -> float:
     score = COEFFICIENTS["constant"] + sum(COEFFICIENTS[name] * value for name, value in evidence.features().items())
     probability = float(min(1.0, evidence.agreement / GOOD_AGREEMENT) / (1 + np.exp(-score)))
     return probability if evidence.is_known else min(probability, UNKNOWN)
+
+
+def doubts(findings: Sequence[Finding]) -> int:
+    """How many ``findings`` are warnings that gripper states, grasps or rotations were recorded wrongly."""
+    return sum(f.severity == "warning" and f.kind in RECORDING and bool(f.cause) for f in findings)
+
+
+def prediction(errors: FloatArray) -> float:
+    """Metres, from the errors ``(I, S)`` of `leave_one_out`: the median over the demonstrations at the best key step.
+
+    The best, because demonstrators are precise where the gripper meets a thing and vary freely elsewhere. The first and
+    the last step count only where there are no others.
+    """
+    between = errors[:, 1:-1] if errors.shape[1] > 2 else errors
+    return float(np.median(between, axis=0).min())
 
 
 def novelty(demonstrated: FloatArray, keypoints: FloatArray) -> float:

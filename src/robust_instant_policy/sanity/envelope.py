@@ -17,7 +17,7 @@ STEP_FACTOR, STEP_MARGIN_M = 1.5, 0.05  # on the longest demonstrated step
 TURN_FACTOR, TURN_MARGIN_RAD = 1.5, np.deg2rad(25.0)  # on the largest demonstrated turn of a step
 TILT_MARGIN_RAD = np.deg2rad(25.0)  # on how far the approach leaned away from its mean direction
 SIDE_FACTOR, SIDE_MARGIN_M = 0.15, 0.005  # on the sides of the gripper's triangle
-FEW = 2.0  # by which margins widen, over the number of demonstrations less one
+FEW = 3.0  # by which margins widen, over the number of demonstrations less one
 LENGTH_FACTOR = 2.0  # on the longest demonstrated path
 DEGREES = 180 / np.pi  # in a radian
 
@@ -52,7 +52,7 @@ class Envelope:
         """Of demonstrated ``trajectories`` with the same number of arms, over the table's ``plane (4,)``.
 
         The extremes of few demonstrations bound a new one less: margins that protect nothing but plausibility widen by
-        1 + 2 / (I - 1), those of height and of the gripper's shape do not.
+        1 + `FEW` / (I - 1), those of height and of the gripper's shape do not.
         """
         thinned = [downsample(trajectory) for trajectory in trajectories]
         points = np.concatenate([trajectory.triplets for trajectory in trajectories])  # (T, A, 3, 3)
