@@ -69,13 +69,16 @@ def keep(rows: Path, row: Row) -> None:
         file.write(json.dumps(row) + "\n")
 
 
-def cases(options: argparse.Namespace) -> list[tuple[str, str, str]]:
+def cases(options: argparse.Namespace, task: str) -> list[tuple[str, str, str]]:
     """(split, fault, camera) in an order that covers every fault early."""
     names = options.faults or ["none", *FAULTS, *HALLUCINATED]
     found = [(split, name, camera) for name in names for split in options.splits for camera in options.cameras]
-    if options.share < 1:  # the same part of the faults for the same task, whatever else is asked for
-        found = [case for case in found if case[1] == "none" or zlib.crc32(repr(case).encode()) / 2**32 < options.share]
-    return found
+
+    # a part of the faults, another one for each task, and the same whatever else is asked for
+    def drawn(case: tuple[str, str, str]) -> float:
+        return zlib.crc32(repr((task, *case)).encode()) / 2**32
+
+    return [case for case in found if case[1] == "none" or drawn(case) < options.share]
 
 
 def run(options: argparse.Namespace) -> None:
@@ -89,7 +92,7 @@ def run(options: argparse.Namespace) -> None:
                 split: demonstrations(options.out / "data" / f"{name}-{split}", task, SPLITS[split][0])
                 for split in options.splits
             }
-            for split, fault, camera in track(cases(options), description=name):
+            for split, fault, camera in track(cases(options, name), description=name):
                 wanted = range(options.scenes * (options.sound if fault == "none" else 1))
                 left = [index for index in wanted if (name, split, fault, camera, index, options.spread) not in done]
                 if left:
