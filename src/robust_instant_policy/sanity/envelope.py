@@ -27,10 +27,11 @@ class Envelope:
     """Limits of a plan's numbers, margins included; A arms.
 
     ``lower`` and ``upper (A, 3)``: corners of the box that holds gripper point and fingertips, metres, world, with
-    the ``margin``, metres; ``lowest (A,)`` height of a fingertip above the table, metres; ``step (A,)`` metres and
-    ``turn (A,)`` rad from one step to the next, of ``steps`` steps; ``approach (A, 3)`` mean direction and ``tilt
-    (A,)`` rad around it; ``sides (A, 3)`` of the gripper's triangle, metres; ``length (A,)`` of the path, metres;
-    ``changes`` the sequences of gripper states, one for each arm, that were demonstrated.
+    the ``margin``, metres; ``lowest (A,)`` height of a fingertip above the table, metres; ``step (A,)`` metres,
+    ``detour (A,)`` metres from the way between its neighbours and ``turn (A,)`` rad from one step to the next, of
+    ``steps`` steps; ``approach (A, 3)`` mean direction and ``tilt (A,)`` rad around it; ``sides (A, 3)`` of the
+    gripper's triangle, metres; ``length (A,)`` of the path, metres; ``changes`` the sequences of gripper states,
+    one for each arm, that were demonstrated.
     """
 
     lower: FloatArray
@@ -38,6 +39,7 @@ class Envelope:
     margin: float
     lowest: FloatArray
     step: FloatArray
+    detour: FloatArray
     turn: FloatArray
     approach: FloatArray
     tilt: FloatArray
@@ -62,6 +64,7 @@ class Envelope:
         leaning = np.arccos(np.clip((directions * mean).sum(axis=-1), -1, 1)).max(axis=0)
         heights = points[:, :, 1:] @ plane[:3] + plane[3]
         steps = np.array([_largest(step_lengths(t)) for t in thinned]).max(axis=0)
+        detours = np.array([_largest(step_detours(t)) for t in thinned]).max(axis=0)
         turns = np.array([_largest(step_turns(t)) for t in thinned]).max(axis=0)
         wider = 1 + FEW / max(len(trajectories) - 1, 1)
         return cls(
@@ -70,6 +73,7 @@ class Envelope:
             margin=wider * POSITION_MARGIN_M,
             lowest=heights.min(axis=(0, 2)) - HEIGHT_MARGIN_M,
             step=steps + wider * ((STEP_FACTOR - 1) * steps + STEP_MARGIN_M),
+            detour=detours + wider * ((STEP_FACTOR - 1) * detours + STEP_MARGIN_M),
             turn=turns + wider * ((TURN_FACTOR - 1) * turns + TURN_MARGIN_RAD),
             approach=mean,
             tilt=leaning + wider * TILT_MARGIN_RAD,
@@ -112,7 +116,9 @@ class Envelope:
             """Report the step with the largest of ``values`` where it exceeds ``limit``."""
             if len(values) and values.max() > limit:
                 step = int(values.argmax())
-                told = words.format(step=step, next=step + 1, value=unit * values[step], limit=unit * limit)
+                told = words.format(
+                    step=step, next=step + 1, after=step + 2, value=unit * values[step], limit=unit * limit
+                )
                 found.append(_outside(kind, name + told, values[step], limit, step))
 
         outside = np.maximum(self.lower[arm] - points, points - self.upper[arm]).max(axis=(1, 2)) + self.margin
@@ -125,6 +131,8 @@ class Envelope:
             found.append(_outside("height", f"{words}: {lowest * 1e3:.0f} mm allowed", heights[step], lowest, step))
         words = "the gripper moves {value:.2f} m from step {step} to {next}, {limit:.2f} m allowed"
         bound("step length", lengths, self.step[arm] * stretch, words)
+        words = "the gripper leaves the way from step {step} to {after} by {value:.2f} m, {limit:.2f} m allowed"
+        bound("detour", step_detours(trajectory)[:, arm], self.detour[arm] * stretch, words)
         words = "the gripper turns {value:.0f} degrees from step {step} to {next}, {limit:.0f} degrees allowed"
         bound("turn", step_turns(trajectory)[:, arm], self.turn[arm] * stretch, words, DEGREES)
         tilts = np.arccos(np.clip(approaches(trajectory)[:, arm] @ self.approach[arm], -1, 1))
@@ -150,6 +158,11 @@ class Envelope:
 def step_lengths(trajectory: Trajectory) -> FloatArray:
     """Metres ``(T - 1, A)`` that the middle of the fingertips moves from step to step."""
     return np.linalg.norm(np.diff(trajectory.triplets[:, :, 1:].mean(axis=2), axis=0), axis=-1)
+
+
+def step_detours(trajectory: Trajectory) -> FloatArray:
+    """Metres ``(T - 2, A)`` from the middle of the fingertips at a step to the middle of its neighbours'."""
+    return np.linalg.norm(np.diff(trajectory.triplets[:, :, 1:].mean(axis=2), n=2, axis=0), axis=-1) / 2
 
 
 def approaches(trajectory: Trajectory) -> FloatArray:
