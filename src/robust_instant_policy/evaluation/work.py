@@ -21,7 +21,8 @@ class Setup:
 
     ``llm`` is a spec for `llm.connect`; with ``replay`` only the answers in ``store`` are used. ``data`` is the folder
     of demonstrations, ``deadline_s`` the time limit of the sampling for one plan. With ``films`` a video of each failed
-    episode is made. ``checkpoints`` is the folder for the weights of trained methods.
+    episode is made. ``checkpoints`` is the folder for the weights of trained methods;
+    ``demo_set`` is the number of the set of demonstrations in ``data``.
     """
 
     llm: str
@@ -31,6 +32,7 @@ class Setup:
     deadline_s: float
     films: bool
     checkpoints: Path = DEFAULT_CHECKPOINTS
+    demo_set: int = 0
 
 
 @dataclass(frozen=True)
