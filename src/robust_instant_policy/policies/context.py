@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from robust_instant_policy.context import Prompt, leave_one_out, write_prompt
+from robust_instant_policy.context.alignment import align
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception import KeypointExtractor, Located
 from robust_instant_policy.policies.confidence import recognition
 from robust_instant_policy.policies.policy import Progress, Stage, Stopwatch, no_progress
 from robust_instant_policy.policies.settings import Settings
-from robust_instant_policy.sanity import Finding, SetReport, check_demonstrations
+from robust_instant_policy.sanity import Finding, SetReport, Surroundings, View, check_demonstrations
 from robust_instant_policy.trajectory import Trajectory, downsample
 
 HARDLY_RECOGNISED = "the scene was hardly recognised; is everything there that was there in the demonstrations?"
@@ -23,8 +24,8 @@ class Context:
     """What every method over keypoints starts from, made from ``demonstrations``.
 
     ``keypoints (I, K, 3)``, metres, world, and ``pixels (I, K, 2)`` (u, v) of the I demonstrations; their downsampled
-    ``trajectories``; the ``prompt`` that serialises both; the ``report`` of what was checked; ``prediction_errors
-    (I, S)`` in metres, see `leave_one_out`; ``notes`` for the user, one line each.
+    ``trajectories``; the ``prompt`` that serialises both; the ``report`` of what was checked; the ``surroundings`` of
+    the gripper; ``prediction_errors (I, S)`` in metres, see `leave_one_out`; ``notes`` for the user, one line each.
     """
 
     demonstrations: tuple[Demonstration, ...]
@@ -34,17 +35,22 @@ class Context:
     trajectories: tuple[Trajectory, ...]
     prompt: Prompt
     report: SetReport
+    surroundings: Surroundings
     prediction_errors: FloatArray
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class LocatedScene:
-    """What was recognised in one observation, what its checks found, and what both cost."""
+    """What was recognised in one observation, what its checks found, and what both cost.
+
+    ``view`` is the observation as the checks see it; None where only keypoints are known.
+    """
 
     located: Located
     stage: Stage
     findings: tuple[Finding, ...] = ()
+    view: View | None = None
 
     @property
     def keypoints(self) -> FloatArray:
@@ -81,6 +87,8 @@ def build_context(
         downsample(demonstration.trajectory, settings.downsampling, settings.num_steps)
         for demonstration in demonstrations
     )
+    aligned = align(trajectories)
+    views = [View.of(demonstrations[index].observation) for index in aligned.kept]
     prompt = write_prompt(extractor.keypoints_, trajectories, settings.frames, settings.layout)
     return Context(
         tuple(demonstrations),
@@ -90,6 +98,7 @@ def build_context(
         trajectories,
         prompt,
         report,
+        Surroundings.of(views, aligned.actions),
         leave_one_out(extractor.keypoints_, trajectories, prompt.frames if settings.frames == "adaptive" else None),
         (*extractor.notes_, *report.notes),
     )
@@ -105,4 +114,4 @@ def locate(context: Context, observation: Observation, progress: Progress = no_p
     with watch.stage("keypoints"):
         findings = context.report.require_observation(observation)
         located = context.extractor.locate(observation)
-    return LocatedScene(located, watch.stages[0], findings)
+    return LocatedScene(located, watch.stages[0], findings, View.of(observation))

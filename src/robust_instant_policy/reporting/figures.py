@@ -252,7 +252,7 @@ def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan])
                 color=colour or look.colour, marker=look.marker, markersize=3, markevery=4, label=label,
             )  # fmt: skip
         panel.set_xlabel("time, share of the episode")
-        panel.set_ylabel(f"palm {'xyz'[axis]} [mm]")
+        panel.set_ylabel(f"gripper {'xyz'[axis]} [mm]")
     handles, labels = panels[0].get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=len(unique))
