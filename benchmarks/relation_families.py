@@ -249,6 +249,7 @@ def height(kit: Kit, layout: Layout, hand: Hand) -> Drawn:
     a, b = layout.things(2)
     tall, wide = layout.number(0.03, 0.15), layout.number(0.6, 1.6)
     shape = kit.shapes[1][:5] * [wide, wide, tall / 0.03]
+    shape[:3, 2] = tall  # most keypoints lie on what a camera sees from above
     release = b @ down([0, 0], tall + 0.02, 0.3)
     return Drawn((at(a, kit.shapes[0][:5]), at(b, shape)), carry(hand(a @ kit.grasps[0]), hand(release)))
 
@@ -258,12 +259,12 @@ def door(kit: Kit, layout: Layout, hand: Hand) -> Drawn:
     opening = layout.number(0.5, 1.9)
     leaf = frame @ turned([0, 0], opening)
     shape = moved(kit.shapes[1][:5], 0.04, 0.04, 0) * [2.2, 0.2, 3.0]
-    handle = down([0.18, 0], 0.08, 0.4)
+    handle = down([0.15, 0], 0.08, 0.4)
     grasp, closing = hand(leaf @ handle), np.linspace(opening, 0, 9)[1:-1]
     shut = hand(frame @ handle)
     arc = [frame @ turned([0, 0], angle) @ handle for angle in closing]
     return Drawn(
-        (at(frame, moved(kit.shapes[0][:5], -0.05)), at(leaf, shape)),
+        (at(frame, moved(2 * kit.shapes[0][:5], -0.08)), at(leaf, shape)),
         single((raised(grasp), 0), (grasp, 0), (grasp, 1), ([*arc, shut], 1), (shut, 0), (raised(shut), 0)),
     )
 
@@ -346,11 +347,11 @@ def lid(kit: Kit, layout: Layout, hand: Hand) -> Drawn:
         return hinge @ make_pose(Rotation.from_rotvec([0, -angle, 0]).as_matrix(), [0, 0, 0])
 
     shape = moved(kit.shapes[1][:4], 0.05) * [1.8, 1.0, 0.1]
-    edge = down([0.17, 0], 0.0, np.pi / 2)
+    edge = down([0.15, 0], 0.0, np.pi / 2)
     grasp, end = hand(raised_lid(opening) @ edge), hand(raised_lid(opening / 2) @ edge)
     arc = [raised_lid(angle) @ edge for angle in np.linspace(opening, opening / 2, 7)[1:-1]]
     return Drawn(
-        (at(box, moved(kit.shapes[0][:6] * [1, 1, 2], 0.05)), at(raised_lid(opening), shape)),
+        (at(box, moved(2 * kit.shapes[0][:6], 0.08)), at(raised_lid(opening), shape)),
         single((backed(grasp), 0), (grasp, 0), (grasp, 1), ([*arc, end], 1), (end, 0), (backed(end), 0)),
     )
 

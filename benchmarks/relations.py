@@ -4,7 +4,8 @@
     python benchmarks/relations.py --quick --llm embedded openai:gpt-4o    # compare language models in ten minutes
     python benchmarks/relations.py --noise 1 2 4 --demos 3 5 10 20
     python benchmarks/relations.py --methods rip --families perp side --scenes 10
-    python benchmarks/relations.py --table                # only write docs/tables/relations.md again
+    python benchmarks/relations.py --confidence           # what Plan.confidence is worth, also in uncovered scenes
+    python benchmarks/relations.py --table                # make no plans, only write the tables again
 
 The families are in `relation_families.py`. For each, sets of demonstrations are drawn, and for each set new scenes.
 Every plan is a row of ``--rows``, written as soon as it is made and not repeated; an interrupted run continues. `rip`,
@@ -28,13 +29,15 @@ from pathlib import Path
 
 import numpy as np
 from pick_and_place import WITHIN_M
-from relation_families import FAMILIES, USUAL, Family, Scene
+from relation_families import FAMILIES, UNCOVERED, USUAL, Family, Scene
 from rich.progress import Progress
+from scipy.stats import mannwhitneyu
 from stand_in import StandIn
 
 from robust_instant_policy.context import FactorisedPrompt
 from robust_instant_policy.errors import PlanningError, RipError
 from robust_instant_policy.evaluation.manifest import code_digest
+from robust_instant_policy.evaluation.statistics import wilson_interval
 from robust_instant_policy.llm import LanguageModel, connect
 from robust_instant_policy.policies import (
     Context,
@@ -52,11 +55,13 @@ from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[1]
-ROWS, TABLE = ROOT / "results" / "relations.jsonl", ROOT / "docs" / "tables" / "relations.md"
+ROWS = ROOT / "results" / "relations.jsonl"
 METHODS = ("median", "neighbours", "gp", "gp-world", "kat", "rip-gauss", "rip")
 ASKING = ("kat", "rip-gauss", "rip")
 CHEAP = ("median", "neighbours", "gp", "gp-world")
 STAND_IN = "stand-in"  # a regression in place of a language model, see `stand_in.py`
+CONFIDENT = ("neighbours", "rip")  # methods whose plans have a confidence
+GATE = 0.9  # confidence from which on a plan would be executed
 FIRST_NEW = 1000  # scenes from here on are new, demonstrations count from 0
 QUICK = {"families": ("place", "push-to", "perp", "nearest", "along"), "sets": 1, "scenes": 4}
 
@@ -330,6 +335,70 @@ def cell(rows: Sequence[Row]) -> str:
     return f"{right:.0%} of {len(errors)}, {in_mm(np.median(errors))}, {in_mm(np.median(ways))}"
 
 
+def confidence_table(rows: Sequence[Row]) -> str:
+    """By method, kind of scene and family: how many plans pass the gate, how many of these are wrong, and AUROC."""
+    lines = [
+        "| method | plans for | plans, right | right ones that pass | wrong among those that pass | AUROC |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for method, model in sorted({(row.case.method, row.case.model) for row in rows}):
+        mine = [row for row in rows if (row.case.method, row.case.model) == (method, model)]
+        parts = {"usual scenes": [row for row in mine if row.case.condition == USUAL]}
+        parts |= {name: [row for row in mine if row.case.condition == name] for name in UNCOVERED}
+        parts["all"] = mine
+        parts |= {f"all, {name}": [row for row in mine if row.case.family == name] for name in FAMILIES}
+        for name, part in parts.items():
+            if part:
+                lines.append(f"| {f'{method} {model}'.strip()} | {name} | " + " | ".join(trust(part)) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def trust(rows: Sequence[Row]) -> list[str]:
+    confidence, right = judgements(rows)
+    passed = confidence >= GATE
+    wrong, through = int((passed & ~right).sum()), int(passed.sum())
+    low, high = wilson_interval(wrong, through)
+    both = right.any() and not right.all()
+    # the probability that a right plan has more confidence than a wrong one, ties half (Mann and Whitney 1947)
+    auroc = mannwhitneyu(confidence[right], confidence[~right]).statistic / right.sum() / (~right).sum() if both else 0
+    return [
+        f"{len(rows)}, {int(right.sum())}",
+        f"{passed[right].mean():.0%}" if right.any() else "–",
+        f"{wrong} of {through}: {wrong / max(through, 1):.1%} ({low:.1%} to {high:.1%})",
+        f"{auroc:.3f}" if both else "–",
+    ]
+
+
+def judgements(rows: Sequence[Row]) -> tuple[np.ndarray, np.ndarray]:
+    """Confidence of each plan, and whether it is right."""
+    confidence = np.array([row.outcome.confidence for row in rows], dtype=float)
+    return confidence, np.array([row.outcome.errors[0] <= WITHIN_M for row in rows], dtype=bool)
+
+
+def draw_reliability(rows: Sequence[Row], path: Path) -> None:
+    """Share of right plans against their confidence, with Wilson's 95% intervals, and how many there are."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(5, 4.5), layout="constrained")
+    axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
+    for number, method in enumerate(dict.fromkeys(row.case.method for row in rows)):
+        confidence, right = judgements([row for row in rows if row.case.method == method])
+        for low, high in pairwise([0, 0.2, 0.4, 0.6, 0.8, GATE, 0.95, 1 + 1e-9]):
+            inside = (confidence >= low) & (confidence < high)
+            if inside.any():
+                share, count = right[inside].mean(), int(inside.sum())
+                least, most = wilson_interval(int(right[inside].sum()), count)
+                at = confidence[inside].mean()
+                label = method if low == 0 or not (confidence < low).any() else None
+                axes.errorbar(
+                    at, share, [[share - least], [most - share]], fmt="os"[number % 2], color=f"C{number}", label=label
+                )
+                axes.annotate(f" {count}", (at, share), fontsize=8)
+    axes.set(xlabel="confidence", ylabel="share of right plans", xlim=(-0.02, 1.06), ylim=(-0.02, 1.02))
+    axes.legend(fontsize=8)
+    figure.savefig(path, metadata={"Date": None})
+
+
 def in_mm(metres: float) -> str:
     return f"{1000 * metres:.1f}" if math.isfinite(metres) else "∞"
 
@@ -349,19 +418,31 @@ def main() -> None:
     parser.add_argument("--deadline", type=float, default=300.0, help="seconds a plan")
     parser.add_argument("--keep", action="store_true", help="do not repeat plans that another version of the code made")
     parser.add_argument("--rows", type=Path, default=ROWS)
-    parser.add_argument("--out", type=Path, default=TABLE, help="the table")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="where the tables and the diagram go")
     parser.add_argument("--table", action="store_true", help="make no plans")
     options = parser.parse_args()
     for name, value in (QUICK if options.quick else {}).items():
         setattr(options, name, value)
+    if options.confidence:
+        options.methods, options.llm = options.methods or CONFIDENT, options.llm or [STAND_IN]
     options.methods = options.methods or (CHEAP + (ASKING if options.llm else ()))
     if not options.table:
         run(options)
-    text = table([row for row in read_rows(options.rows) if row.case.split == options.split])
+    rows = [row for row in read_rows(options.rows) if row.case.split == options.split]
+    usual = [row for row in rows if row.case.condition == USUAL]
+    examined = {row.case.family for row in rows if row.case.condition != USUAL}
+    judged_rows = [row for row in rows if row.case.method in CONFIDENT and row.case.family in examined]
+    write(options.out / "tables" / "relations.md", table(usual))
+    if judged_rows:
+        write(options.out / "tables" / "relations_confidence.md", confidence_table(judged_rows))
+        (options.out / "images").mkdir(exist_ok=True)
+        draw_reliability(judged_rows, options.out / "images" / "relations_confidence.svg")
+
+
+def write(path: Path, text: str) -> None:
     print(text)
-    if options.split == "measure":
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(text)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from relations import WITHIN_M, key_error, read_rows, way_error
 
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.policies import (
+    KeypointRegression,
     Neighbours,
     Settings,
     context_of_keypoints,
@@ -61,13 +62,29 @@ def test_a_plan_needs_keypoints_only():
 
 
 def test_the_benchmark_writes_rows_once_and_a_table(tmp_path):
-    rows, table = tmp_path / "rows.jsonl", tmp_path / "table.md"
+    rows = tmp_path / "rows.jsonl"
     command = [
-        sys.executable, str(ROOT / "benchmarks" / "relations.py"), "--rows", str(rows), "--out", str(table),
+        sys.executable, str(ROOT / "benchmarks" / "relations.py"), "--rows", str(rows), "--out", str(tmp_path),
         "--families", "place", "--sets", "1", "--scenes", "1", "--demos", "5",
         "--methods", "median", "neighbours", "rip", "--llm", "stand-in",
     ]  # fmt: skip
     for _ in range(2):
         subprocess.run(command, capture_output=True, text=True, check=True)
         assert sorted(row.case.method for row in read_rows(rows)) == ["kat", "median", "neighbours", "rip", "rip-gauss"]
-    assert "| place | 100% of 1" in table.read_text()
+    assert "| place | 100% of 1" in (tmp_path / "tables" / "relations.md").read_text()
+
+
+def test_a_gaussian_process_learns_what_the_chosen_frames_leave_over():
+    draw = FAMILIES["place"].scenes("tune", 0, 0.002)
+    shown, new = [draw(number) for number in range(10)], [draw(1000 + number, exact=True) for number in range(10)]
+    errors = {}
+    for settings in (Settings(frames="world"), Settings()):
+        context = context_of_keypoints(
+            np.stack([scene.keypoints for scene in shown]), [scene.path for scene in shown], settings
+        )
+        policy = KeypointRegression(settings).fit_context(context)
+        plans = [policy.plan_scene(scene_of_keypoints(scene.keypoints)) for scene in new]
+        errors[settings.frames] = [
+            key_error(plan.trajectory, scene.path) for plan, scene in zip(plans, new, strict=True)
+        ]
+    assert np.median(errors["adaptive"]) < 0.5 * np.median(errors["world"])
