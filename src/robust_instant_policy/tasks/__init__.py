@@ -27,6 +27,7 @@ class Family:
 
 FAMILIES = (
     Family("maniskill", "sim", "", ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")),
+    Family("maniskill", "sim", "", ("push-cube-anywhere", "stack", "wipe", "sort")),  # relations between things
     Family(
         "aloha",
         "aloha",

@@ -8,14 +8,15 @@ import torch
 from mani_skill.utils.building import actors
 from mani_skill.utils.registration import register_env
 
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
-from robust_instant_policy.tasks.poses import downward
+from robust_instant_policy.tasks.poses import downward, facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 CUBE_HALF_SIZE_M = 0.02
 CUBE_RANGE_M = 0.1  # the cube's x and y lie within ± this
-CUBE_COLOR = (12 / 255, 42 / 255, 160 / 255, 1.0)
+CUBE_COLORS = {"seen": (12 / 255, 42 / 255, 160 / 255, 1.0), "unseen": (0.05, 0.35, 0.12, 1.0)}
 GOAL_RADIUS_M = 0.1
 GOAL_DISTANCE_M = 0.1 + GOAL_RADIUS_M  # from the cube, along +x
 HEIGHT_TOLERANCE_M = 5e-3
@@ -36,7 +37,7 @@ class PushCubeEnv(CellEnv):
         self.cube = actors.build_cube(
             self.scene,
             half_size=CUBE_HALF_SIZE_M,
-            color=np.array(CUBE_COLOR),
+            color=np.array(CUBE_COLORS[self.objects]),
             name="cube",
             initial_pose=sapien.Pose(p=[0, 0, CUBE_HALF_SIZE_M]),
         )
@@ -52,10 +53,15 @@ class PushCubeEnv(CellEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
-        x, y = self.draw("pose").uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2)
+        (x, y), goal = self.draw_places(self.draw("pose"))
         self.cube.set_pose(sapien.Pose([x, y, CUBE_HALF_SIZE_M]))
         flat = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]  # the disc's axis is its x axis
-        self.goal.set_pose(sapien.Pose([x + GOAL_DISTANCE_M, y, 1e-3], flat))
+        self.goal.set_pose(sapien.Pose([*goal, 1e-3], flat))
+
+    def draw_places(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Where cube and goal are: x and y ``(2,)`` of each, metres."""
+        cube = rng.uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2)
+        return cube, cube + np.array([GOAL_DISTANCE_M, 0.0])
 
     def failure(self) -> str:
         cube, goal = self.cube.pose.p[0], self.goal.pose.p[0]
@@ -69,15 +75,22 @@ class PushCubeEnv(CellEnv):
 
 
 def push(env: PushCubeEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Close the gripper, descend behind the cube, push it along +x into the goal, and retreat."""
-    x, y, _ = env.cube.pose.p[0].tolist()
-    behind = x - CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M - APPROACH_M
-    end = x + GOAL_DISTANCE_M - CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
+    """Close the gripper, descend behind the cube, push it straight into the goal, and retreat."""
+    cube, goal = (actor.pose.p[0, :2].cpu().numpy().astype(np.float64) for actor in (env.cube, env.goal))
+    distance = float(np.linalg.norm(goal - cube))
+    x, y = (goal - cube) / distance
+    line = facing(*cube, float(np.arctan2(y, x)))  # x from the cube to the goal
+    contact = -CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M
+    behind, end = contact - APPROACH_M, contact + distance + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
+
+    def at(along: float, z: float) -> FloatArray:
+        return (line @ downward(along, 0.0, z))[None]
+
     return [
-        Stroke(np.array([downward(behind, y, CLEARANCE_M)]), closed=True, free=True, speed=0.35, error=0.004),
-        Stroke(np.array([downward(behind, y, PUSH_HEIGHT_M)]), closed=True, speed=0.15),
-        Stroke(np.array([downward(end, y, PUSH_HEIGHT_M)]), closed=True, speed=0.18),
-        Stroke(np.array([downward(end - APPROACH_M, y, CLEARANCE_M)]), closed=True, free=True, error=0.006),
+        Stroke(at(behind, CLEARANCE_M), closed=True, free=True, speed=0.35, error=0.004),
+        Stroke(at(behind, PUSH_HEIGHT_M), closed=True, speed=0.15),
+        Stroke(at(end, PUSH_HEIGHT_M), closed=True, speed=0.18),
+        Stroke(at(end - APPROACH_M, CLEARANCE_M), closed=True, free=True, error=0.006),
     ]
 
 
