@@ -38,7 +38,7 @@ WORKSPACE = np.array([[-0.34, -0.4, -0.005], [0.46, 0.4, 0.4]])
 
 
 class CellEnv(BaseEnv):
-    """Base of the five environments; a subclass adds its objects and its condition of success."""
+    """Base of the environments; a subclass adds its objects and its condition of success."""
 
     SUPPORTED_ROBOTS = ("ur5e_hande",)
     SUPPORTED_REWARD_MODES = ("sparse", "none")
