@@ -27,6 +27,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pick_and_place import WITHIN_M
@@ -260,7 +261,16 @@ def read_rows(path: Path) -> list[Row]:
 def keep(path: Path, row: Row) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
-        file.write(json.dumps(asdict(row)) + "\n")
+        file.write(json.dumps(rounded(asdict(row))) + "\n")
+
+
+def rounded(value: Any) -> Any:
+    """``value`` with all its numbers to a hundredth of a millimetre, for short lines."""
+    if isinstance(value, float):
+        return round(value, 5) if math.isfinite(value) else value
+    if isinstance(value, dict):
+        return {name: rounded(one) for name, one in value.items()}
+    return [rounded(one) for one in value] if isinstance(value, tuple | list) else value
 
 
 def cases(options: argparse.Namespace) -> list[Case]:
