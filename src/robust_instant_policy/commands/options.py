@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from robust_instant_policy.tasks.level import LEVELS, PAPER
 from robust_instant_policy.tasks.task import bounded_seed
 
 DATA = Path("data")  # demonstrations, one folder per task
@@ -40,6 +41,22 @@ def add_assets(parser: argparse.ArgumentParser) -> None:
         default="code",
         help="objects built in code, or downloaded for ManiSkill (default: %(default)s)",
     )
+
+
+def add_level(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--level",
+        choices=tuple(LEVELS),
+        default=PAPER.name,
+        help="difficulty of the scenes: as in the paper, or with camera noise, rotated objects, distractors, "
+        "other tables and light, hidden parts and start poses (default: %(default)s)",
+    )
+
+
+def data_folder(assets: str, level: str, demo_set: int = 0) -> Path:
+    """Where demonstrations with these objects at this level are kept, those of one set apart from those of others."""
+    unusual = [value for value, usual in ((assets, "code"), (level, PAPER.name)) if value != usual]
+    return DATA.joinpath(*unusual, *([f"set-{demo_set}"] if demo_set else []))
 
 
 def add_method(parser: argparse.ArgumentParser) -> None:

@@ -245,7 +245,7 @@ def _with_demonstrations(
         shown = stored_demonstrations(folder, task, count)
         of_task = [trial for trial in trials if trial[0].task == task]
         if len(shown) < count and not all(plain(trial) in done for trial in of_task):
-            shown = _record(task, of_task[0][0].assets, folder, count, with_images, progress)
+            shown = _record(of_task[0][0], setup.demo_set, folder, count, with_images, progress)
         digests[task, with_images] = demonstration_digests(shown)
 
     def digest(trial: Trial) -> str:
@@ -257,13 +257,12 @@ def _with_demonstrations(
 
 
 def _record(
-    name: str, assets: str, folder: Path, count: int, with_images: bool, progress: Progress
+    scene: Scene, demo_set: int, folder: Path, count: int, with_images: bool, progress: Progress
 ) -> list[Demonstration]:
-    task = make_task(name, assets=assets)
+    task = make_task(scene.task, assets=scene.assets, level=scene.level)
+    report = partial(progress.recording, scene.task)
     try:
-        return obtain_demonstrations(
-            task, folder, count, lambda *so_far: progress.recording(name, *so_far), with_images
-        )
+        return obtain_demonstrations(task, folder, count, report, with_images, demo_set)
     finally:
         task.close()
 

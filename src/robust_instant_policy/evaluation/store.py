@@ -90,10 +90,7 @@ class ResultsStore:
             is_new = not _EPISODES.columns(self._database)
             for table in (_EPISODES, _FAILURES, _INVOCATIONS):
                 table.create(self._database)
-            self._database.execute(
-                "CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, content TEXT NOT NULL, "
-                "PRIMARY KEY (name, objects, assets))"
-            )
+            _create_suites(self._database)
             if is_new:
                 self._take(_read_exports(folder))
 
@@ -143,12 +140,12 @@ class ResultsStore:
             _EPISODES.insert(self._database, episode)
         for failure in results.failures:
             _FAILURES.insert(self._database, failure)
-        known = {(suite.name, suite.objects, suite.assets): suite for suite in _read_suites(self._database)}
+        known = {suite.identity: suite for suite in _read_suites(self._database)}
         for suite in results.manifest.suites:
-            identity = suite.name, suite.objects, suite.assets
+            identity = suite.identity
             known[identity] = known[identity].merged(suite) if identity in known else suite
             self._database.execute(
-                "INSERT INTO suites VALUES (?, ?, ?, ?) ON CONFLICT DO UPDATE SET content = excluded.content",
+                "INSERT INTO suites VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET content = excluded.content",
                 (*identity, json.dumps(asdict(known[identity]))),
             )
         for command in results.manifest.invocations:
@@ -275,6 +272,20 @@ _KEY = (*_columns_of(Scene), *_columns_of(Variant), "candidate")
 _EPISODES = _Table("episodes", Episode, _KEY)
 _FAILURES = _Table("failures", Failure, _KEY)
 _INVOCATIONS = _Table("invocations", Invocation, _columns_of(Invocation))
+
+
+def _create_suites(database: sqlite3.Connection) -> None:
+    """Make the table of suites, or make it anew from that of a version that knew no levels."""
+    columns = {row[1] for row in database.execute("PRAGMA table_info(suites)")}
+    if columns and "level" not in columns:
+        database.execute("ALTER TABLE suites RENAME TO older_suites")
+    database.execute(
+        "CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, level TEXT, content TEXT NOT NULL, "
+        "PRIMARY KEY (name, objects, assets, level))"
+    )
+    if columns and "level" not in columns:
+        database.execute("INSERT INTO suites SELECT name, objects, assets, 'paper', content FROM older_suites")
+        database.execute("DROP TABLE older_suites")
 
 
 def _read(database: sqlite3.Connection) -> Results:

@@ -20,7 +20,8 @@ class Variant:
     ``demos`` demonstrations are shown; ``queries`` is the paper's Q, ``dof`` its ν; ``downsampling``, ``frames``,
     ``layout`` and ``features`` are those of `Settings`; ``model`` names the language model; ``steps`` is how long
     a method is trained; ``deadline_s`` bounds the sampling for one plan; ``code`` is the `code_digest` of the package,
-    which stands for every setting that has no name here; ``demonstrations`` the digest of those that were shown. What
+    which stands for every setting that has no name here; ``demonstrations`` the digest of those that were shown, which
+    are of the set ``demo_set`` (see `scenes.first_demonstration_seed`). What
     a method does not use is always empty (a number None), so that the same work is never done, nor counted, under two
     names; RIP with ν = ∞ is "rip-gauss". Rows of versions that did not note a setting have it empty, too: unknown.
     """
@@ -38,6 +39,7 @@ class Variant:
     deadline_s: float | None = None
     code: str = ""
     demonstrations: str = ""
+    demo_set: int = 0
 
     def __post_init__(self) -> None:
         changed: dict[str, str | float | None] = {}
@@ -74,6 +76,7 @@ class Variant:
             self.frames,
             self.layout,
             "" if self.steps is None else f"{self.steps}steps",
+            f"set{self.demo_set}" if self.demo_set else "",
         )
         return "-".join(word for word in words if word)
 
@@ -123,16 +126,19 @@ def require_no_path(*names: str) -> None:
 class Scene:
     """A drawn scene of ``task``, with ``objects`` that are "seen" in the demonstrations or "unseen".
 
-    ``assets`` is where their shapes come from: built in "code", or "maniskill"'s downloads.
+    ``assets`` is where their shapes come from: built in "code", or "maniskill"'s downloads; ``level`` is "paper" or
+    "hard", see `tasks.level.Level`.
     """
 
     task: str
     objects: str
     seed: int
     assets: str = "code"
+    level: str = "paper"
 
     def __post_init__(self) -> None:
-        require_no_path(self.task, self.objects, self.assets)
+        require_no_path(self.task, self.objects, self.assets, self.level)
 
     def __str__(self) -> str:
-        return f"{self.task}-{self.objects}-{self.seed}" + ("" if self.assets == "code" else f"-{self.assets}")
+        unusual = [value for value, usual in ((self.assets, "code"), (self.level, "paper")) if value != usual]
+        return "-".join((self.task, self.objects, str(self.seed), *unusual))

@@ -21,7 +21,7 @@ class Setup:
 
     ``llm`` is a line for `llm.connect`; with ``replay`` only stored answers are used. ``deadline_s`` bounds the
     sampling for one plan. With ``films`` every failed episode is filmed. ``checkpoints`` is where methods that are
-    trained keep their weights.
+    trained keep their weights; ``demo_set`` is the number of the set of demonstrations that ``data`` holds.
     """
 
     llm: str
@@ -31,6 +31,7 @@ class Setup:
     deadline_s: float
     films: bool
     checkpoints: Path = DEFAULT_CHECKPOINTS
+    demo_set: int = 0
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,12 @@ class Workbench:
         self._report = report
         self._demonstrations = demonstrations or self._read_demonstrations
         self._task: Task | None = None
-        self._place = ("", "", "")  # the task, the set of objects and their source that the simulator holds
+        self._place = (
+            "",
+            "",
+            "",
+            "",
+        )  # the task, the set of objects, their source and the level that the simulator holds
         self._forget()
 
     def run(self, work: SceneWork) -> Iterator[Outcome]:
@@ -115,14 +120,14 @@ class Workbench:
         return RecordedModel(connect(self._setup.llm), store)
 
     def _enter(self, scene: Scene) -> Task:
-        place = (scene.task, scene.objects, scene.assets)
+        place = (scene.task, scene.objects, scene.assets, scene.level)
         if self._task is None or self._place != place:
             if self._task is not None:
                 self._task.close()
                 self._task = None
             if self._place[0] != scene.task:
                 self._forget()
-            self._task = make_task(scene.task, scene.objects, scene.assets)
+            self._task = make_task(scene.task, scene.objects, scene.assets, scene.level)
             self._place = place
         return self._task
 
@@ -219,8 +224,8 @@ class Workbench:
         if len(seeds) < len(shown):
             return None
         if len(self._shown_truth) < demos:
-            name, objects, assets = self._place
-            apart = None if objects == "seen" else make_task(name, assets=assets)
+            name, objects, assets, level = self._place
+            apart = None if objects == "seen" else make_task(name, assets=assets, level=level)
             task = apart or self._task
             assert task is not None
             try:

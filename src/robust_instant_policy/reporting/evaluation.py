@@ -11,6 +11,7 @@ from robust_instant_policy.evaluation.failures import Failure, video_file
 from robust_instant_policy.files import read_regular
 from robust_instant_policy.reporting.pages import data_uri, render
 from robust_instant_policy.reporting.tables import Table
+from robust_instant_policy.tasks.level import PAPER
 
 TITLES = {
     "chosen": "Success rates",
@@ -42,22 +43,24 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class Section:
-    """One suite: its name, the ``kinds`` of its objects where they are not the usual ones, its figure as SVG and its
-    tables.
+    """One suite: its name and level, the ``kinds`` of its objects where they are not the level's usual ones, its figure
+    as SVG and its tables.
     """
 
     name: str
+    level: str
     kinds: tuple[str, ...]
     figure: bytes
     tables: Sequence[Table]
 
     @property
     def title(self) -> str:
-        return TITLES[self.name] + (f" ({', '.join(self.kinds)} objects)" if self.kinds else "")
+        level = "" if self.level == PAPER.name else f", {self.level} scenes"
+        return TITLES[self.name] + level + (f" ({', '.join(self.kinds)} objects)" if self.kinds else "")
 
     @property
     def anchor(self) -> str:
-        return "-".join((self.name, *self.kinds))
+        return "-".join((self.name, *([] if self.level == PAPER.name else [self.level]), *self.kinds))
 
     @property
     def image(self) -> str:

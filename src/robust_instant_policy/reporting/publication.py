@@ -16,6 +16,7 @@ from robust_instant_policy.policies import Plan
 from robust_instant_policy.reporting.evaluation import Section, evaluation_page
 from robust_instant_policy.reporting.figures import draw, encode
 from robust_instant_policy.reporting.tables import Table, failure_table, invocation_table, tables
+from robust_instant_policy.tasks.level import make_level
 
 TABLE_FILE = "table.md"
 FAILURE_TABLE_FILE = "failures.md"
@@ -57,10 +58,11 @@ def publish(out: Path) -> str:
 
 def _publish_suite(out: Path, summary: Summary) -> Section:
     suite = summary.suite
-    kinds = tuple(kind for kind, usual in ((suite.objects, "seen"), (suite.assets, "code")) if kind != usual)
+    usual = make_level(suite.level).objects
+    kinds = tuple(kind for kind, expected in ((suite.objects, usual), (suite.assets, "code")) if kind != expected)
     figure = draw(summary, _kept_plans(out, summary))
     drawing = encode(figure, "svg")
-    section = Section(suite.name, kinds, drawing, tables(summary))
+    section = Section(suite.name, suite.level, kinds, drawing, tables(summary))
     stem = section.anchor
     write_whole(out / f"{stem}.svg", drawing)
     write_whole(out / f"{stem}.png", encode(figure, "png"))

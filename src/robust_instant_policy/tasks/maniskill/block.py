@@ -41,6 +41,11 @@ class Block:
         return builder.build_kinematic(name) if fixed else builder.build(name)
 
 
+def corners(x: float, y: float) -> FloatArray:
+    """Corners ``(4, 2)`` of a rectangle with edges of ``x`` and ``y`` metres around the origin."""
+    return np.array([(side * x / 2, other * y / 2) for side in (-1, 1) for other in (-1, 1)])
+
+
 def pose_of(actor: Actor) -> FloatArray:
     """Pose ``(4, 4)`` of an actor in the world."""
     return actor.pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)

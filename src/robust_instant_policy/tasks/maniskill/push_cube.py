@@ -7,8 +7,9 @@ import sapien
 import torch
 from mani_skill.utils.building import actors
 from mani_skill.utils.registration import register_env
+from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.poses import downward, facing
@@ -22,6 +23,7 @@ GOAL_DISTANCE_M = 0.1 + GOAL_RADIUS_M  # from the cube, along +x
 HEIGHT_TOLERANCE_M = 5e-3
 
 FINGER_HALF_WIDTH_M = 0.011
+BEHIND_M = -CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M  # fingers that touch the cube, from its middle
 APPROACH_M = 0.05  # between fingers and cube while the gripper descends
 CLEARANCE_M = 0.1  # travel height of the gripper
 PUSH_HEIGHT_M = 0.015
@@ -30,7 +32,13 @@ OVERSHOOT_M = 0.02  # the demonstrator stops within ± this of the middle of the
 
 @register_env("RIP-PushCube-v1", max_episode_steps=600)
 class PushCubeEnv(CellEnv):
-    """Success: the cube's centre within the goal disc, the cube still on the table."""
+    """Success: the cube's centre within the goal disc, the cube still on the table.
+
+    ``push_pose (4, 4)`` is the frame on the table under the cube, x towards the goal, ``distance`` metres away.
+    """
+
+    push_pose: FloatArray
+    distance: float
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
@@ -51,17 +59,17 @@ class PushCubeEnv(CellEnv):
             initial_pose=sapien.Pose(p=[GOAL_DISTANCE_M, 0, 1e-3]),
         )
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        super()._initialize_episode(env_idx, options)
-        (x, y), goal = self.draw_places(self.draw("pose"))
-        self.cube.set_pose(sapien.Pose([x, y, CUBE_HALF_SIZE_M]))
-        flat = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]  # the disc's axis is its x axis
-        self.goal.set_pose(sapien.Pose([*goal, 1e-3], flat))
+    def place_objects(self) -> None:
+        pose, self.distance, turn = self.draw_push(self.draw("pose"))
+        self.push_pose = self.layout.place(pose, [(BEHIND_M - APPROACH_M, 0.0), (self.distance, 0.0)])
+        cube = facing(0.0, 0.0, turn) @ make_pose(np.eye(3), (0.0, 0.0, CUBE_HALF_SIZE_M))
+        self.cube.set_pose(sapien.Pose(self.push_pose @ cube))
+        on_its_face = Rotation.from_euler("y", 90, degrees=True).as_matrix()  # the disc's axis is its x axis
+        self.goal.set_pose(sapien.Pose(self.push_pose @ make_pose(on_its_face, (self.distance, 0.0, 1e-3))))
 
-    def draw_places(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Where cube and goal are: x and y ``(2,)`` of each, metres."""
-        cube = rng.uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2)
-        return cube, cube + np.array([GOAL_DISTANCE_M, 0.0])
+    def draw_push(self, rng: np.random.Generator) -> tuple[FloatArray, float, float]:
+        """The pose and the distance of the push, and how far the cube is turned in it, rad."""
+        return facing(*rng.uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2), 0.0), GOAL_DISTANCE_M, 0.0
 
     def failure(self) -> str:
         cube, goal = self.cube.pose.p[0], self.goal.pose.p[0]
@@ -76,15 +84,11 @@ class PushCubeEnv(CellEnv):
 
 def push(env: PushCubeEnv, rng: np.random.Generator) -> list[Stroke]:
     """Close the gripper, descend behind the cube, push it straight into the goal, and retreat."""
-    cube, goal = (actor.pose.p[0, :2].cpu().numpy().astype(np.float64) for actor in (env.cube, env.goal))
-    distance = float(np.linalg.norm(goal - cube))
-    x, y = (goal - cube) / distance
-    line = facing(*cube, float(np.arctan2(y, x)))  # x from the cube to the goal
-    contact = -CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M
-    behind, end = contact - APPROACH_M, contact + distance + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
+    behind = BEHIND_M - APPROACH_M
+    end = BEHIND_M + env.distance + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
 
     def at(along: float, z: float) -> FloatArray:
-        return (line @ downward(along, 0.0, z))[None]
+        return (env.push_pose @ downward(along, 0.0, z))[None]
 
     return [
         Stroke(at(behind, CLEARANCE_M), closed=True, free=True, speed=0.35, error=0.004),

@@ -10,6 +10,7 @@ from mani_skill.utils.registration import register_env
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.maniskill.push_cube import SPEC as PUSH_CUBE
 from robust_instant_policy.tasks.maniskill.push_cube import PushCubeEnv
+from robust_instant_policy.tasks.poses import facing
 
 TABLE_M = np.array([[-0.14, -0.24], [0.24, 0.24]])  # corners of the area in which cube and goal lie
 DISTANCE_M = (0.16, 0.24)  # from the cube to the middle of the goal
@@ -19,12 +20,13 @@ DISTANCE_M = (0.16, 0.24)  # from the cube to the middle of the goal
 class PushCubeAnywhereEnv(PushCubeEnv):
     """Success: as in `PushCubeEnv`."""
 
-    def draw_places(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def draw_push(self, rng: np.random.Generator) -> tuple[FloatArray, float, float]:
         while True:
             cube, angle = rng.uniform(*TABLE_M), rng.uniform(-np.pi, np.pi)
-            goal = cube + rng.uniform(*DISTANCE_M) * np.array([np.cos(angle), np.sin(angle)])
+            distance = float(rng.uniform(*DISTANCE_M))
+            goal = cube + distance * np.array([np.cos(angle), np.sin(angle)])
             if (TABLE_M[0] <= goal).all() and (goal <= TABLE_M[1]).all():
-                return cube, goal
+                return facing(*cube, angle), distance, -angle
 
 
 SPEC = replace(

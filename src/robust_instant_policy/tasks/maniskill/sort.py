@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import sapien
-import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs.actor import Actor
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.demonstrator import Stroke
-from robust_instant_policy.tasks.maniskill.block import Block, apart, is_still, pose_of, scattered
+from robust_instant_policy.tasks.maniskill.block import Block, apart, corners, is_still, pose_of, scattered
 from robust_instant_policy.tasks.maniskill.carpentry import add_box
 from robust_instant_policy.tasks.maniskill.cell import BASE_POSITION_M, CellEnv
 from robust_instant_policy.tasks.maniskill.paint import BLACK, BRASS, RED, STEEL, WHITE, Paint
@@ -47,8 +46,7 @@ class SortEnv(CellEnv):
         self.blocks = first.build(self.scene, "first block"), second.build(self.scene, "second block")
         self.tray = _build_tray(self.scene)
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        super()._initialize_episode(env_idx, options)
+    def place_objects(self) -> None:
         rng = self.draw("pose")
 
         def distances(places: FloatArray) -> FloatArray:
@@ -58,10 +56,14 @@ class SortEnv(CellEnv):
             return apart(places) >= APART_M and abs(np.diff(distances(places))[0]) >= CLEAR_M
 
         places = scattered(rng, TABLE_M, 2, fit)
+        for number, (block, place) in enumerate(zip(self.blocks, places, strict=True)):
+            pose = facing(*place, rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
+            pose = self.layout.place(pose, [(0.0, 0.0)], corners(*SIZE_M[self.objects][:2]))
+            places[number] = pose[:2, 3]
+            block.set_pose(sapien.Pose(pose))
         self.nearer = int(distances(places).argmin())
-        for block, place in zip(self.blocks, places, strict=True):
-            block.set_pose(sapien.Pose(facing(*place, rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))))
-        self.tray.set_pose(sapien.Pose([*TRAY_M, 0.0]))
+        tray = self.layout.place(facing(*TRAY_M, 0.0), [(0.0, 0.0)], corners(*TRAY_SIZE_M[:2]), turn=0.0)
+        self.tray.set_pose(sapien.Pose(tray))
 
     def failure(self) -> str:
         nearer, other = self.blocks[self.nearer], self.blocks[1 - self.nearer]

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import sapien
-import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs.actor import Actor
 
 from robust_instant_policy.tasks.demonstrator import Stroke
-from robust_instant_policy.tasks.maniskill.block import Block, apart, is_still, pose_of, scattered
+from robust_instant_policy.tasks.maniskill.block import Block, apart, corners, is_still, pose_of, scattered
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.paint import BLACK, BRASS, RED, WHITE, Paint
 from robust_instant_policy.tasks.picking import Pick, set_down
@@ -46,12 +45,12 @@ class StackEnv(CellEnv):
         self.cube = Block((EDGE_M,) * 3, paint, (mark,)).build(self.scene, "cube")
         self.base = Block((self.base_edge,) * 3, base_paint, (mark,)).build(self.scene, "base")
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        super()._initialize_episode(env_idx, options)
+    def place_objects(self) -> None:
         rng = self.draw("pose")
         places = scattered(rng, TABLE_M, 2, lambda places: apart(places) >= APART_M)
-        for actor, place in zip((self.cube, self.base), places, strict=True):
-            actor.set_pose(sapien.Pose(facing(*place, rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))))
+        for actor, edge, place in zip((self.cube, self.base), (EDGE_M, self.base_edge), places, strict=True):
+            pose = facing(*place, rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
+            actor.set_pose(sapien.Pose(self.layout.place(pose, [(0.0, 0.0)], corners(edge, edge))))
 
     def failure(self) -> str:
         if self.agent.is_grasping(self.cube):

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import sapien
-import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs.actor import Actor
 
 from robust_instant_policy.geometry import FloatArray, invert_pose
 from robust_instant_policy.tasks.demonstrator import Stroke
-from robust_instant_policy.tasks.maniskill.block import Block, pose_of
+from robust_instant_policy.tasks.maniskill.block import Block, corners, pose_of
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.paint import BLACK, BRASS, RED, WHITE, Paint
 from robust_instant_policy.tasks.poses import downward, facing
@@ -46,10 +45,11 @@ class WipeEnv(CellEnv):
         size = (self.length, WIDTH_M[self.objects], self.height)
         self.bar = Block(size, PAINTS[self.objects], MARKS[self.objects]).build(self.scene, "bar", fixed=True)
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        super()._initialize_episode(env_idx, options)
+    def place_objects(self) -> None:
         rng = self.draw("pose")
         pose = facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), rng.uniform(*YAW_RANGE_RAD) + np.pi)
+        ends = [(-self.length / 2, 0.0), (self.length / 2, 0.0)]
+        pose = self.layout.place(pose, ends, corners(self.length, WIDTH_M[self.objects]))
         self.bar.set_pose(sapien.Pose(pose))
         self.wiped = np.zeros(round(self.length / CELL_M), dtype=bool)
 
