@@ -24,7 +24,6 @@ class StandIn:
     """Answers a query of the factorised layout by ridge regression on its examples."""
 
     context_length = None
-    counts_exactly = False
 
     def __init__(self, spread: float = 0.0, hallucinated: float = 0.0):
         self.spread, self.hallucinated = spread, hallucinated

@@ -27,7 +27,7 @@ SETTINGS = Settings(features="efficientnet")
 class Imitator:
     """Stands in for a language model: answers with the prompt's own examples, or with ``says``; some are ``lost``."""
 
-    name, context_length, counts_exactly = "imitator", None, False
+    name, context_length = "imitator", None
 
     def __init__(self, lost=(), says=None):
         self.lost, self.says = lost, says

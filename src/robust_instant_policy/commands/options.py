@@ -12,7 +12,6 @@ from robust_instant_policy.tasks.task import bounded_seed
 DATA = Path("data")  # demonstrations, one folder per task
 RUNS = Path("runs")
 CHECKPOINTS = Path("checkpoints")
-SEED_BITS = 62  # seeds, and those counted up from them, stand in tables of 64-bit integers
 
 
 def natural(text: str) -> int:
@@ -24,7 +23,7 @@ def natural(text: str) -> int:
 
 def seed(text: str) -> int:
     """A whole number, 0 or more; one that is too large for simulators and tables is mapped to a smaller one."""
-    return bounded_seed(natural(text), SEED_BITS)
+    return bounded_seed(natural(text))
 
 
 def positive(text: str) -> int:

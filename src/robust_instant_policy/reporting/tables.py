@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from statistics import fmean
 
 from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.episodes import Episode
@@ -16,14 +15,13 @@ from robust_instant_policy.evaluation.statistics import (
     Summary,
     mark,
     mean_and_deviation,
-    paired_test,
     reference,
-    t_test,
 )
 from robust_instant_policy.evaluation.variant import Variant, by_demos, dof_symbol, labels, values
 from robust_instant_policy.policies import METHOD_NAMES
 
 NONE = "–"
+INTERVAL = "Wilson's 95% interval with one trial a scene"
 
 
 @dataclass(frozen=True)
@@ -48,6 +46,9 @@ def success_table(summary: Summary) -> Table:
     """Table I: one row a method, for each task the success rate in percent and the paper's own beside it."""
     ours = reference(summary.variants)
     told = [task for task in summary.tasks if task in paper.TABLE1_TASKS]
+    stars = {one.variant: one.mark for one in summary.compare(ours)} if ours is not None else {}
+    sets = {variant: summary.of_sets(variant) for variant in summary.variants}
+    several = any(len(rates) > 1 for rates in sets.values())
     head = ["method"]
     for task in summary.tasks:
         head += [task, "paper"] if task in told else [task]
@@ -59,24 +60,23 @@ def success_table(summary: Summary) -> Table:
             if task in told:
                 percent = paper.table1(variant.method, task)
                 row.append(NONE if percent is None else str(percent))
-        stars = ""
-        if ours is not None and variant != ours:
-            own, others = _both(summary, ours, variant)
-            stars = mark(t_test(own, others)) if own and fmean(own) > fmean(others) else ""
         tried = [task for task in told if summary.rate(variant, task) is not None]
-        row += [_spread(summary, variant, stars), _paper_average(variant, tried)]
-        rows.append(tuple(row))
+        row.append(_spread(summary, variant, stars.get(variant, "")))
+        if several:
+            row.append(", ".join(f"{100 * rate:.1f}" for rate in sets[variant].values()))
+        rows.append((*row, _paper_average(variant, tried)))
     counts = ", ".join(
         f"{label} {_executions(summary, variant)}"
         for variant, label in zip(summary.variants, labels(summary.variants), strict=True)
     )
+    by_set = "The averages with each set of demonstrations stand beside them. " if several else ""
     return Table(
-        (*head, "average", "paper"),
+        (*head, "average", *(["with each set"] if several else []), "paper"),
         tuple(rows),
-        "Success in percent; in parentheses Wilson's 95% interval; the best of a task is bold. Averages are mean ± "
-        "standard deviation over the tasks that the method was tried in, the paper's over the same; RIP is "
-        "significantly better than those marked \\* or \\*\\* (t-test as in the paper, p < 0.05 and p < 0.005). "
-        f"Executions a task: {counts}.",
+        f"Success in percent; in parentheses {INTERVAL}; the best of a task is bold. Averages are mean ± standard "
+        f"deviation over the tasks that the method was tried in, the paper's over the same. {by_set}RIP is "
+        "significantly better than those marked \\* or \\*\\* (sign-flip test over scenes, Holm's correction for the "
+        f"methods in this table, p < 0.05 and p < 0.005). Executions a task: {counts}.",
     )
 
 
@@ -85,28 +85,37 @@ def test_table(summary: Summary) -> Table | None:
     ours = reference(summary.variants)
     if ours is None or len(summary.variants) == 1:
         return None
+    told = dict(zip(summary.variants, labels(summary.variants), strict=True))
     rows = []
-    for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
-        if variant == ours:
-            continue
-        paired = paired_test(summary.of_scenes(ours), summary.of_scenes(variant))
-        own, theirs = _both(summary, ours, variant)
+    for one in summary.compare(ours):
+        low, high = one.interval
         rows.append(
             (
-                label,
-                f"{100 * (fmean(own) - fmean(theirs)):+.1f}" if own else NONE,
-                _p(t_test(own, theirs)),
-                str(paired.scenes),
-                str(paired.better),
-                str(paired.worse),
-                _p(paired.p) if paired.scenes else NONE,
+                told[one.variant],
+                f"{100 * one.difference:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})" if one.paired.scenes else NONE,
+                str(one.paired.scenes),
+                str(one.paired.better),
+                str(one.paired.worse),
+                _p(one.paired.p) if one.paired.scenes else NONE,
+                _p(one.corrected),
+                _p(one.t_test),
             )
         )
-    head = ("rip against", "difference", "t-test p", "shared scenes", "rip better in", "worse in", "paired p")
+    head = (
+        "rip against",
+        "difference",
+        "shared scenes",
+        "rip better in",
+        "worse in",
+        "paired p",
+        "Holm's p",
+        "t-test p",
+    )
     note = (
-        "Difference in percentage points of the averages over the tasks that both methods were tried in. The t-test is "
-        "the paper's, over these tasks; the paired test is exact, over the scenes that both methods were tried in "
-        "(McNemar's where each has one execution)."
+        "Difference in percentage points of the averages over the tasks that both methods were tried in, with the same "
+        "scenes and sets of demonstrations; in parentheses its 95% interval (cluster bootstrap over scenes). The "
+        "paired test is the exact sign-flip test over shared scenes (McNemar's where each has one execution); Holm's p "
+        "corrects it for the number of methods. The t-test is the paper's, over tasks, without correction."
     )
     return Table(head, tuple(rows), note)
 
@@ -124,7 +133,7 @@ def sweep_table(summary: Summary, name: str, value: Callable[[Variant], str]) ->
         head,
         tuple(rows),
         f"Success of {summary.variants[0].method} in percent, {summary.variants[0].demos} demonstrations shown; in "
-        "parentheses Wilson's 95% interval; the best of a task is bold. Averages: mean ± standard deviation over "
+        f"parentheses {INTERVAL}; the best of a task is bold. Averages: mean ± standard deviation over "
         f"tasks. Executions a task: {', '.join(counts)}.",
     )
 
@@ -142,14 +151,14 @@ def demos_table(summary: Summary) -> Table:
                 continue
             low, high = pooled.interval
             cells.append(
-                f"{_spread(summary, of_count[count])} ({100 * low:.0f} to {100 * high:.0f}, n={pooled.trials})"
+                f"{_spread(summary, of_count[count])} ({100 * low:.0f} to {100 * high:.0f}, n={pooled.scenes})"
             )
         rows.append((label, *cells))
     return Table(
         ("method", *(f"{count} shown" for count in counts)),
         tuple(rows),
-        f"Success in percent, mean ± standard deviation over {', '.join(summary.tasks)}; in parentheses Wilson's 95% "
-        "interval of all n executions together.",
+        f"Success in percent, mean ± standard deviation over {', '.join(summary.tasks)}; in parentheses "
+        f"{INTERVAL}, of all n scenes together.",
     )
 
 
@@ -197,11 +206,6 @@ def invocation_table(invocations: Sequence[Invocation], episodes: Sequence[Episo
         if invocations
         else "Nothing is known of the commands that wrote these rows.",
     )
-
-
-def _both(summary: Summary, one: Variant, other: Variant) -> tuple[list[float], list[float]]:
-    """The success rates of both in the tasks that both were tried in."""
-    return summary.of_tasks(one, other), summary.of_tasks(other, one)
 
 
 def _cell(rate: Rate | None, best: float) -> str:
