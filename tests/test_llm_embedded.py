@@ -77,7 +77,7 @@ def test_the_deadline_stops_a_long_answer(embedded):
     embedded.sample([question(3)], Sampling(1, temperature=1.0))
     start = time.monotonic()
     assert embedded.sample([Query("7 8 9\n", 900)], Sampling(1, temperature=1.0, deadline_s=0.5)) == [[]]
-    assert time.monotonic() - start < 0.5 + 5  # the whole answer takes 14 s
+    assert time.monotonic() - start < 0.5 + 5  # 900 tokens take longer
 
 
 def test_the_deadline_holds_while_a_long_prompt_is_read(embedded):
