@@ -90,7 +90,8 @@ class Workbench:
             if isinstance(policy, RememberingPolicy):
                 with suppress(KeypointError, PlanningError):
                     yield Planned(work.scene, variant, policy.plan(observation))
-        yield from self._analyse(task, work.scene, failed, observation)
+        if self._setup.analyses:
+            yield from self._analyse(task, work.scene, failed, observation)
 
     def train(self, work: SceneWork, variant: Variant) -> TrainedPolicy:
         """Train the policy of ``variant`` for the scene of ``work``, as `run` would."""
@@ -166,8 +167,9 @@ class Workbench:
         settings = Settings(
             features=variant.features, downsampling=variant.downsampling, num_queries=variant.queries
         ).changed(workspace=self._task.workspace)
-        if variant.frames:  # empty for methods that write no prompt
-            settings = settings.changed(frames=variant.frames, layout=variant.layout)
+        for name in ("keypoints", "column", "frames", "layout", "estimator"):  # empty where the method has none
+            if value := getattr(variant, name):
+                settings = settings.changed(**{name: value})
         return settings if variant.dof is None else settings.changed(dof=variant.dof)
 
     def _policy(self, variant: Variant) -> RememberingPolicy | ClosedLoopPolicy:

@@ -88,8 +88,11 @@ def push(env: PushCubeEnv, rng: np.random.Generator) -> list[Stroke]:
     behind = BEHIND_M - APPROACH_M
     end = BEHIND_M + env.distance + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
 
+    cube = env.push_pose.copy()
+    cube[:2, 3] = env.cube.pose.p[0, :2].tolist()  # in the simulator's precision
+
     def at(along: float, z: float) -> FloatArray:
-        return (env.push_pose @ downward(along, 0.0, z))[None]
+        return (cube @ downward(along, 0.0, z))[None]
 
     return [
         Stroke(at(behind, CLEARANCE_M), closed=True, free=True, speed=0.35, error=0.004),
