@@ -9,7 +9,7 @@ import numpy as np
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.consistency import MIN_DEMONSTRATIONS
-from robust_instant_policy.sanity.contact import gaps
+from robust_instant_policy.sanity.contact import closings, gaps
 from robust_instant_policy.sanity.envelope import approaches
 from robust_instant_policy.sanity.finding import Finding
 from robust_instant_policy.sanity.geometry import MIN_SHARE, TOUCH_M, Evidence, touch_distance
@@ -45,10 +45,9 @@ def check_tool_frame(demonstrations: Sequence[Demonstration], views: Sequence[Vi
 def _reaching_angles(demonstration: Demonstration, view: View) -> list[float]:
     """Angle, rad, between the last `REACHED_M` of the way to each grasp and the gripper's approach axis there."""
     trajectory = demonstration.trajectory
-    closed = trajectory.gripper_state > 0.5
     middles, forward = trajectory.triplets[:, :, 1:].mean(axis=2), approaches(trajectory)
     found = []
-    for step, arm in np.argwhere(closed[1:] & ~closed[:-1]) + np.array([1, 0]):
+    for step, arm in closings(trajectory):
         way = middles[step, arm] - middles[:step, arm]
         before = np.flatnonzero(np.linalg.norm(way, axis=1) > REACHED_M)
         if len(before) and _gap(view, middles[step, arm]) < touch_distance(view):
@@ -88,8 +87,7 @@ def check_fingers(demonstrations: Sequence[Demonstration], views: Sequence[View]
     """Where grippers close, their open fingertips are beside the object, not in it."""
     inside, above, offsets = 0, [], []
     for demonstration, view in zip(demonstrations, views, strict=True):
-        closed = demonstration.trajectory.gripper_state > 0.5
-        for step, arm in np.argwhere(closed[1:] & ~closed[:-1]) + np.array([1, 0]):
+        for step, arm in closings(demonstration.trajectory):
             left, right = demonstration.trajectory.triplets[step, arm, 1:]
             line = left + ALONG_FINGERS[:, None] * (right - left)
             covered = view.covered(line)
