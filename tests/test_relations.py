@@ -9,7 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-from relation_families import FAMILIES
+from relation_families import FAMILIES, UNCOVERED
 from relations import WITHIN_M, key_error, read_rows, way_error
 
 from robust_instant_policy.errors import UsageError
@@ -88,3 +88,16 @@ def test_a_gaussian_process_learns_what_the_chosen_frames_leave_over():
             key_error(plan.trajectory, scene.path) for plan, scene in zip(plans, new, strict=True)
         ]
     assert np.median(errors["adaptive"]) < 0.5 * np.median(errors["world"])
+
+
+def test_the_benchmark_says_what_the_confidence_is_worth(tmp_path):
+    command = [
+        sys.executable, str(ROOT / "benchmarks" / "relations.py"), "--rows", str(tmp_path / "rows.jsonl"),
+        "--out", str(tmp_path), "--families", "place", "--sets", "1", "--scenes", "1", "--methods", "neighbours",
+        "--confidence",
+    ]  # fmt: skip
+    subprocess.run(command, capture_output=True, text=True, check=True)
+    table = (tmp_path / "tables" / "relations_confidence.md").read_text()
+    for kind in ("usual scenes", *UNCOVERED):
+        assert f"| neighbours | {kind} | 1, " in table
+    assert (tmp_path / "images" / "relations_confidence.svg").stat().st_size > 1000

@@ -92,11 +92,11 @@ class Evidence:
         return {**dict.fromkeys(found, 0.0), **ratios, "doubts": -float(self.doubts), "warnings": -float(self.warnings)}
 
 
-def plan_confidence(evidence: Evidence) -> float:
+def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEFFICIENTS) -> float:
     """Probability in [0, 1] that the plan is right; 0 where a check found an error."""
     if evidence.errors:
         return 0.0
-    score = COEFFICIENTS["constant"] + sum(COEFFICIENTS[name] * value for name, value in evidence.features().items())
+    score = coefficients["constant"] + sum(coefficients[name] * value for name, value in evidence.features().items())
     probability = float(min(1.0, evidence.agreement / GOOD_AGREEMENT) / (1 + np.exp(-score)))
     return probability if evidence.is_known else min(probability, UNKNOWN)
 
