@@ -14,6 +14,7 @@ from robust_instant_policy.commands.options import (
     add_level,
     add_method,
     data_folder,
+    method_settings,
     positive,
     seed,
 )
@@ -50,8 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--methods",
         nargs="+",
         metavar="METHOD",
-        help="of rip rip-gauss rip-adaptive kat dp kat-dp neighbours gp "
-        "(default: rip rip-gauss kat, or those of the suite)",
+        help="of rip rip-gauss mean rip-adaptive kat dp kat-dp neighbours gp "
+        "(default: rip rip-gauss mean kat, or those of the suite)",
     )
     parser.add_argument(
         "--demos", type=positive, default=10, metavar="N", help="demonstrations per task (default: %(default)s)"
@@ -101,20 +102,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--keep", action="store_true", help="do not repeat what another version of the code has executed"
     )
     parser.add_argument("--no-videos", action="store_true", help="no videos of failed episodes")
+    parser.add_argument("--no-analysis", action="store_true", help="no causes and videos of failed episodes")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to continue")
     add_method(parser)
 
 
 def run(options: argparse.Namespace) -> int:
+    settings = method_settings(options)
     base = Variant(
         "rip",
         demos=options.demos,
         queries=options.queries,
-        downsampling=options.downsampling,
-        frames=options.frames,
-        layout=options.layout,
-        features=options.features,
+        downsampling=settings.downsampling,
+        frames=settings.frames,
+        layout=settings.layout,
+        features=settings.features,
         model=model_name(options.llm),
+        keypoints=settings.keypoints,
+        column=settings.column,
+        estimator=settings.estimator,
     )
     steps = options.steps or DEFAULT_STEPS
     choice = Choice(
@@ -139,6 +145,7 @@ def run(options: argparse.Namespace) -> int:
             films=not options.no_videos,
             checkpoints=options.checkpoints,
             demo_set=demo_set,
+            analyses=not options.no_analysis,
         )
         for demo_set in range(options.sets)
     ]

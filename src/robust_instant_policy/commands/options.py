@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
+from robust_instant_policy.policies.settings import CONFIGS, WORDS, Settings
 from robust_instant_policy.tasks.level import LEVELS, PAPER
 from robust_instant_policy.tasks.task import bounded_seed
 
@@ -59,26 +59,22 @@ def data_folder(assets: str, level: str, demo_set: int = 0) -> Path:
 
 
 def add_method(parser: argparse.ArgumentParser) -> None:
-    """Add the settings of the method; `method_settings` reads them."""
+    """Add the settings of the method; `method_settings` and `deadline` read them."""
     parser.add_argument(
-        "--frames",
-        choices=("adaptive", "world"),
+        "--config",
+        choices=tuple(CONFIGS),
         default="adaptive",
-        help="frames of the prompt; world: as in the paper (default: %(default)s)",
+        help="paper, paper-real: as in the paper, with a column of its Table II; the settings below change parts of it "
+        "(default: %(default)s)",
     )
-    parser.add_argument(
-        "--layout",
-        choices=("factorised", "sequence"),
-        default="factorised",
-        help="layout of the prompt; sequence: as in the paper (default: %(default)s)",
-    )
-    parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
-    parser.add_argument(
-        "--downsampling",
-        choices=("masked", "uniform"),
-        default="masked",
-        help="masked keeps gripper changes (default: %(default)s)",
-    )
+    add_keypoints(parser)
+    for name, words in (
+        ("frames", "frames of the prompt"),
+        ("layout", "layout of the prompt"),
+        ("downsampling", "masked keeps gripper changes"),
+        ("estimator", "regression; em-number: the model of the paper's networks, fitted exactly"),
+    ):
+        parser.add_argument(f"--{name}", choices=WORDS[name], help=f"{words} (default: that of --config)")
     parser.add_argument(
         "--deadline",
         type=positive,
@@ -88,9 +84,22 @@ def add_method(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def method_settings(options: argparse.Namespace) -> dict[str, Any]:
-    settings = {name: getattr(options, name) for name in ("frames", "layout", "features", "downsampling")}
-    return {**settings, "deadline_s": float(options.deadline)}
+def add_keypoints(parser: argparse.ArgumentParser) -> None:
+    """Add the settings of the keypoints."""
+    parser.add_argument("--features", help="image descriptors (default: auto, or dino with --config paper)")
+    parser.add_argument(
+        "--keypoints",
+        choices=WORDS["keypoints"],
+        help="keypoints by registration of objects, or by nearest descriptors as in the paper "
+        "(default: registration, or nearest with --config paper)",
+    )
+
+
+def method_settings(options: argparse.Namespace) -> Settings:
+    """Those of ``--config``, and what was given beside it."""
+    names = ("features", "keypoints", "frames", "layout", "downsampling", "estimator")
+    given = {name: getattr(options, name) for name in names}
+    return Settings.of(options.config).changed(**{name: value for name, value in given.items() if value is not None})
 
 
 def beside(folder: Path, ending: str) -> Path:

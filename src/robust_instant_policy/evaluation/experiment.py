@@ -95,7 +95,7 @@ def run_suites(
         progress.outcome(done, len(trials), None)
         drawn = set(wanted_trials(suite for suite in suites if suite.keeps_plans))
         kept = {trial for trial in trials if _apart_from("demonstrations", trial) in drawn}
-        works = missing_work(trials, kept, executed, results.failures, out, setup.films)
+        works = missing_work(trials, kept, executed, results.failures, out, setup.films, setup.analyses)
         if not works:
             return
         _train_missing(works, setup, progress)
@@ -176,6 +176,7 @@ def missing_work(
     failures: Iterable[Failure],
     out: Path,
     films: bool,
+    analyses: bool = True,
 ) -> list[SceneWork]:
     """The missing work for ``trials``, one value a scene. The plans of the trials in ``kept`` are stored in files."""
     examined = {failure.key for failure in failures}
@@ -193,7 +194,7 @@ def missing_work(
             scene,
             work.variants if is_complete(rows) else (*work.variants, variant),
             work.done.union(row.key for row in rows),
-            (*work.failed, *(row for row in rows if not row.success and not is_analysed(row))),
+            (*work.failed, *(row for row in rows if analyses and not row.success and not is_analysed(row))),
             work.plans if planned else (*work.plans, variant),
         )
     return [work for work in works.values() if work.concerned]

@@ -334,7 +334,7 @@ def _explained(path: Path) -> Iterator[None]:
         yield
     except sqlite3.OperationalError as error:
         raise DatasetError(
-            f"cannot use {path}: {error}; what was finished is kept: free space on the disk, or wait for the process "
+            f"cannot use {path}: {error}; finished work is kept: free space on the disk, or wait for the process "
             "that uses it, and run the same command again"
         ) from None
     except (sqlite3.DatabaseError, ValueError, KeyError, TypeError) as error:

@@ -10,7 +10,7 @@ from typing import Any
 from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.evaluation.paper import TABLE1_TASKS
 from robust_instant_policy.evaluation.scenes import scene_seed
-from robust_instant_policy.evaluation.variant import Scene, Variant, require_no_path
+from robust_instant_policy.evaluation.variant import Scene, Variant, configs, require_no_path
 from robust_instant_policy.policies import METHOD_NAMES
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.tasks import TASK_NAMES, UNSEEN_TASKS
@@ -24,7 +24,8 @@ QUERIES = (2, 3, 5, 10)
 DOFS = (1.25, 1.5, 3.0, math.inf)
 HYPERPARAMETER_DEMOS = 20  # shown where Q and ν are varied
 CHOSEN = "chosen"  # not an analysis of the paper: what the user's tasks and methods say
-SAMPLING_METHODS = ("rip", "rip-gauss", "kat")  # those of the paper that share their samples
+SAMPLING_METHODS = ("rip", "rip-gauss", "mean", "kat")  # those that share their samples
+PAPER_METHODS = (*SAMPLING_METHODS, "dp", "kat-dp")  # those that there are in the paper's configuration, by default
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,13 @@ class Suite:
         """Whether plans are kept, to be drawn."""
         return self.name == "trajectories"
 
+    def by_config(self) -> dict[str, Suite]:
+        """The suite of each configuration by itself; methods for which all configurations are one stand in each."""
+        return {
+            config: replace(self, variants=tuple(one for one in self.variants if one.config in (config, "")))
+            for config in configs(self.variants)
+        }
+
     def merged(self, other: Suite) -> Suite:
         """This and another suite of the same name, objects, assets and level as one."""
         return replace(
@@ -133,6 +141,8 @@ def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:
 
 
 def _methods(choice: Choice, default: Sequence[str] = METHOD_NAMES) -> list[Variant]:
+    if choice.base.config != "adaptive":
+        default = [method for method in default if method in PAPER_METHODS]
     return [replace(choice.base, method=method, steps=choice.steps) for method in choice.methods or default]
 
 

@@ -20,8 +20,8 @@ class Setup:
     """Settings that all workers share.
 
     ``llm`` is a spec for `llm.connect`; with ``replay`` only the answers in ``store`` are used. ``data`` is the folder
-    of demonstrations, ``deadline_s`` the time limit of the sampling for one plan. With ``films`` a video of each failed
-    episode is made. ``checkpoints`` is the folder for the weights of trained methods;
+    of demonstrations, ``deadline_s`` the time limit of the sampling for one plan. With ``analyses`` each failed
+    episode is analysed, and with ``films`` filmed. ``checkpoints`` is the folder for the weights of trained methods;
     ``demo_set`` is the number of the set of demonstrations in ``data``.
     """
 
@@ -33,6 +33,7 @@ class Setup:
     films: bool
     checkpoints: Path = DEFAULT_CHECKPOINTS
     demo_set: int = 0
+    analyses: bool = True
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,8 @@ class Workbench:
             if isinstance(policy, RememberingPolicy):
                 with suppress(KeypointError, PlanningError):
                     yield Planned(work.scene, variant, policy.plan(observation))
-        yield from self._analyse(task, work.scene, failed, observation)
+        if self._setup.analyses:
+            yield from self._analyse(task, work.scene, failed, observation)
 
     def train(self, work: SceneWork, variant: Variant) -> TrainedPolicy:
         """Train the policy of ``variant`` for the scene of ``work``, as `run` would."""
@@ -166,8 +167,9 @@ class Workbench:
         settings = Settings(
             features=variant.features, downsampling=variant.downsampling, num_queries=variant.queries
         ).changed(workspace=self._task.workspace)
-        if variant.frames:  # empty for methods that write no prompt
-            settings = settings.changed(frames=variant.frames, layout=variant.layout)
+        for name in ("keypoints", "column", "frames", "layout", "estimator"):  # empty where the method has none
+            if value := getattr(variant, name):
+                settings = settings.changed(**{name: value})
         return settings if variant.dof is None else settings.changed(dof=variant.dof)
 
     def _policy(self, variant: Variant) -> RememberingPolicy | ClosedLoopPolicy:
@@ -180,10 +182,9 @@ class Workbench:
             if isinstance(policy, KeypointPolicy):
                 policy.fit_context(self.context(variant.demos, policy.settings))
                 self._policies[variant] = RememberingPolicy(self, policy, variant.demos)
-            elif isinstance(policy, ClosedLoopPolicy):
-                self._policies[variant] = policy.fit(
-                    self._read_demonstrations(self._place[0], variant.demos, with_images=True)
-                )
+            else:  # in closed loop; what it has after `fit` only makes it no `ClosedLoopPolicy` for isinstance yet
+                shown = self._read_demonstrations(self._place[0], variant.demos, with_images=True)
+                self._policies[variant] = cast(ClosedLoopPolicy, policy).fit(shown)
         return self._policies[variant]
 
     def _analyse(

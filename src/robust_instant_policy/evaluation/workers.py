@@ -149,7 +149,7 @@ class Agenda:
         deaths = self._deaths[work.scene] = self._deaths.get(work.scene, 0) + 1
         if deaths >= MAX_DEATHS:
             raise RipError(
-                f"scene {work.scene} ended {deaths} workers, the last with {cause}; what was finished is kept: use "
-                "fewer --workers if memory ran out, and run the same command again to go on"
+                f"scene {work.scene} ended {deaths} workers, the last with {cause}; finished work is kept: use "
+                "fewer --workers if memory ran out, and run the same command again to continue"
             )
         self._works.insert(0, work)

@@ -228,7 +228,7 @@ class LlamaModel:
         params.n_parallel = layout.slots
         params.kv_unified = False
         params.n_ctx = layout.tokens * layout.slots
-        # Layers with a sliding window forget what they read; a slot that is to go on from a prompt must not.
+        # Without it, layers with a sliding window drop their cache, and a slot cannot continue from a prompt.
         params.swa_full = True
         params.cache_ram_mib = 0
         threads = _free_cores() if layout.is_long else 1

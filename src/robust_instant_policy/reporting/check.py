@@ -1,4 +1,4 @@
-"""A self-contained page on `sanity.check_demonstrations`: what is wrong, and what each image shows."""
+"""A self-contained page with the findings of `sanity.check_demonstrations` and the start images."""
 
 from __future__ import annotations
 

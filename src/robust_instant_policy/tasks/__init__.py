@@ -28,6 +28,7 @@ class Family:
 
 FAMILIES = (
     Family("maniskill", "sim", "", ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")),
+    Family("maniskill", "sim", "", ("push-cube-anywhere", "stack", "wipe", "sort")),  # relations between things
     Family(
         "aloha",
         "aloha",
@@ -36,7 +37,9 @@ FAMILIES = (
     ),
 )
 # Those with a second set of objects, which no demonstration shows.
-UNSEEN_TASKS = ("close-cabinet", "turn-faucet", "aloha-pick-place", "aloha-sweep")
+UNSEEN_TASKS = (
+    "close-cabinet", "turn-faucet", "push-cube-anywhere", "stack", "wipe", "sort", "aloha-pick-place", "aloha-sweep",
+)  # fmt: skip
 TASK_NAMES = tuple(name for family in FAMILIES for name in family.names)
 
 

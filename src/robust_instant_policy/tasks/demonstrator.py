@@ -50,15 +50,15 @@ class Stroke:
 
 
 def shorter_turns(starts: FloatArray, strokes: Sequence[Stroke]) -> list[Stroke]:
-    """``strokes`` with the hands of arms rotated by half a turn where that is nearer to their ``starts (A, 4, 4)``:
-    the two fingers of a parallel gripper are interchangeable."""
+    """``strokes`` with the hands of arms rotated by half a turn about their approach where that is nearer to their
+    ``starts (A, 4, 4)``: the two fingers of a parallel gripper are interchangeable."""
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    rotated = {}
+    rotated: dict[int, bool] = {}
     for stroke in strokes:
         if stroke.arm not in rotated:
             turn = Rotation.from_matrix(starts[stroke.arm, :3, :3].T @ stroke.poses[0, :3, :3])
-            other = turn * Rotation.from_matrix(half_turn[:3, :3])
-            rotated[stroke.arm] = bool(other.magnitude() < turn.magnitude())
+            _, _, z, w = turn.as_quat()
+            rotated[stroke.arm] = bool(abs(z) > abs(w))  # the twist about the approach, z, is more than 90 degrees
     return [replace(one, poses=one.poses @ half_turn) if rotated[one.arm] else one for one in strokes]
 
 

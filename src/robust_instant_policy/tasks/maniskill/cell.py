@@ -45,7 +45,7 @@ MAT_M = 0.0005  # height of the cover that gives the table another colour
 
 
 class CellEnv(BaseEnv):
-    """Base of the five environments; a subclass adds its objects and its condition of success."""
+    """Base of the environments; a subclass adds its objects and its condition of success."""
 
     SUPPORTED_ROBOTS = ("ur5e_hande",)
     SUPPORTED_REWARD_MODES = ("sparse", "none")

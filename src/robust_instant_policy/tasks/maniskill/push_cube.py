@@ -17,7 +17,7 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 CUBE_HALF_SIZE_M = 0.02
 CUBE_RANGE_M = 0.1  # the cube's x and y lie within ± this
-CUBE_COLOR = (12 / 255, 42 / 255, 160 / 255, 1.0)
+CUBE_COLORS = {"seen": (12 / 255, 42 / 255, 160 / 255, 1.0), "unseen": (0.05, 0.35, 0.12, 1.0)}
 GOAL_RADIUS_M = 0.1
 GOAL_DISTANCE_M = 0.1 + GOAL_RADIUS_M  # from the cube, along +x
 HEIGHT_TOLERANCE_M = 5e-3
@@ -34,17 +34,18 @@ OVERSHOOT_M = 0.02  # the demonstrator stops within ± this of the middle of the
 class PushCubeEnv(CellEnv):
     """Success: the cube's centre within the goal disc, the cube still on the table.
 
-    ``push_pose (4, 4)`` is the frame on the table under the cube, x towards the goal.
+    ``push_pose (4, 4)`` is the frame on the table under the cube, x towards the goal, ``distance`` metres away.
     """
 
     push_pose: FloatArray
+    distance: float
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
         self.cube = actors.build_cube(
             self.scene,
             half_size=CUBE_HALF_SIZE_M,
-            color=np.array(CUBE_COLOR),
+            color=np.array(CUBE_COLORS[self.objects]),
             name="cube",
             initial_pose=sapien.Pose(p=[0, 0, CUBE_HALF_SIZE_M]),
         )
@@ -59,11 +60,17 @@ class PushCubeEnv(CellEnv):
         )
 
     def place_objects(self) -> None:
-        x, y = self.draw("pose").uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2)
-        self.push_pose = self.layout.place(facing(x, y, 0.0), [(BEHIND_M - APPROACH_M, 0.0), (GOAL_DISTANCE_M, 0.0)])
-        self.cube.set_pose(sapien.Pose(self.push_pose @ make_pose(np.eye(3), (0.0, 0.0, CUBE_HALF_SIZE_M))))
+        pose, self.distance, turn = self.draw_push(self.draw("pose"))
+        self.push_pose = self.layout.place(pose, [(BEHIND_M - APPROACH_M, 0.0), (self.distance, 0.0)])
+        cube = facing(0.0, 0.0, turn) @ make_pose(np.eye(3), (0.0, 0.0, CUBE_HALF_SIZE_M))
+        self.cube.set_pose(sapien.Pose(self.push_pose @ cube))
         on_its_face = Rotation.from_euler("y", 90, degrees=True).as_matrix()  # the disc's axis is its x axis
-        self.goal.set_pose(sapien.Pose(self.push_pose @ make_pose(on_its_face, (GOAL_DISTANCE_M, 0.0, 1e-3))))
+        self.goal.set_pose(sapien.Pose(self.push_pose @ make_pose(on_its_face, (self.distance, 0.0, 1e-3))))
+
+    def draw_push(self, rng: np.random.Generator) -> tuple[FloatArray, float, float]:
+        """The pose and the distance of the push, and how far the cube is turned in it, rad."""
+        x, y = rng.uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2)
+        return facing(x, y, 0.0), GOAL_DISTANCE_M, 0.0
 
     def failure(self) -> str:
         cube, goal = self.cube.pose.p[0], self.goal.pose.p[0]
@@ -79,10 +86,13 @@ class PushCubeEnv(CellEnv):
 def push(env: PushCubeEnv, rng: np.random.Generator) -> list[Stroke]:
     """Close the gripper, descend behind the cube, push it straight into the goal, and retreat."""
     behind = BEHIND_M - APPROACH_M
-    end = BEHIND_M + GOAL_DISTANCE_M + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
+    end = BEHIND_M + env.distance + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
+
+    cube = env.push_pose.copy()
+    cube[:2, 3] = env.cube.pose.p[0, :2].tolist()  # in the simulator's precision
 
     def at(along: float, z: float) -> FloatArray:
-        return (env.push_pose @ downward(along, 0.0, z))[None]
+        return (cube @ downward(along, 0.0, z))[None]
 
     return [
         Stroke(at(behind, CLEARANCE_M), closed=True, free=True, speed=0.35, error=0.004),

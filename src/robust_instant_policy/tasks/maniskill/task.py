@@ -1,4 +1,4 @@
-"""The five tasks of the ManiSkill cell as `tasks.task.Task`."""
+"""The tasks of the ManiSkill cell as `tasks.task.Task`."""
 
 from __future__ import annotations
 
