@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from robust_instant_policy.context.codec import MM
-from robust_instant_policy.context.frames import WORLD, Frame, candidate_frames, choose_frames, poses_in
+from robust_instant_policy.context.choice import adaptive_frames
+from robust_instant_policy.context.frames import WORLD_FRAME, Frame
+from robust_instant_policy.context.things import locate
 from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
@@ -25,22 +27,15 @@ class StepFrames:
 
     @classmethod
     def world(cls, num_steps: int, num_arms: int) -> StepFrames:
-        return cls(((WORLD,) * num_steps,) * num_arms)
+        return cls(((WORLD_FRAME,) * num_steps,) * num_arms)
 
     @classmethod
     def adaptive(cls, keypoints: FloatArray, actions: FloatArray, key_steps: Sequence[int]) -> StepFrames:
         """The frames in which demonstrations with ``keypoints (I, K, 3)``, aligned ``actions (I, T, 10·A)``, agree
         best; ``key_steps`` count more (see `choose_frames`)."""
-        candidates = candidate_frames(keypoints)
-        poses = poses_in(candidates, keypoints)
         points = actions.reshape(*actions.shape[:2], -1, ACTION_DIM)[..., :STATE_INDEX]
-        points = points.reshape(*points.shape[:-1], 3, 3)
-        return cls(
-            tuple(
-                tuple(candidates[index] for index in choose_frames(candidates, poses, points[:, :, arm], key_steps))
-                for arm in range(points.shape[2])
-            )
-        )
+        hands = points.reshape(*points.shape[:-1], 3, 3)
+        return cls(tuple(map(tuple, adaptive_frames(keypoints, hands, key_steps))))
 
     @property
     def num_arms(self) -> int:
@@ -49,7 +44,8 @@ class StepFrames:
     def poses(self, keypoints: FloatArray) -> FloatArray:
         """Pose of each step's frame ``(T, A, 4, 4)`` in the scene of ``keypoints (K, 3)``."""
         frames = [frame for of_step in zip(*self.arms, strict=True) for frame in of_step]
-        return poses_in(frames, keypoints[None])[:, 0].reshape(-1, self.num_arms, 4, 4)
+        scene = locate({thing: None for frame in frames for thing in frame.things}, keypoints[None])
+        return np.stack([frame.pose_in(scene)[0] for frame in frames]).reshape(-1, self.num_arms, 4, 4)
 
     def encode(self, keypoints: FloatArray, actions: FloatArray) -> FloatArray:
         """The numbers ``(T, 10·A)`` of ``actions (T, 10·A)`` in the scene of ``keypoints (K, 3)``."""
