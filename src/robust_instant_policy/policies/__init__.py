@@ -15,7 +15,14 @@ from robust_instant_policy.policies.catalogue import (
     make_policy,
     make_trained_policy,
 )
-from robust_instant_policy.policies.context import Context, LocatedScene, build_context, locate
+from robust_instant_policy.policies.context import (
+    Context,
+    LocatedScene,
+    build_context,
+    context_of_keypoints,
+    locate,
+    scene_of_keypoints,
+)
 from robust_instant_policy.policies.gp import KeypointRegression
 from robust_instant_policy.policies.instant import KeypointActionTokens
 from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
@@ -51,11 +58,13 @@ __all__ = [
     "Usage",
     "aggregate",
     "build_context",
+    "context_of_keypoints",
     "locate",
     "make_policy",
     "make_trained_policy",
     "propose",
     "sample",
+    "scene_of_keypoints",
 ]
 
 _RENAMED = {"KeypointContext": "Settings", "InstantPolicy": "KeypointActionTokens"}
