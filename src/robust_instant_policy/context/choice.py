@@ -25,8 +25,6 @@ from robust_instant_policy.context.things import (
     WORLD,
     Scene,
     Thing,
-    find_things,
-    locate,
 )
 from robust_instant_policy.geometry import FloatArray
 
@@ -34,7 +32,7 @@ NOISE_M = 0.003  # of demonstrated points in a frame that suits them
 # Standard deviations a priori of what is fitted: share of the way; a point in a thing, an offset, its growth in metres.
 SHARE_STD, POINT_STD_M, OFFSET_STD_M, GROWTH_STD_M = 0.7, 0.04, 0.5, 0.1
 PARAMETER_COST = 0.02  # of a fitted number, in logarithms of the error
-TRANSITION_COST = 0.5  # of a change of frame between two steps, in logarithms of the error
+TRANSITION_COST = 1.0  # of a change of frame between two steps, in logarithms of the error
 KEY_STEP_WEIGHT = 3.0  # of the first and last step and of gripper changes; 1 elsewhere
 DISTANCE_SHARE = 0.05  # error a metre to the thing that is expected of a single demonstration
 MAX_LOOSE = 4  # keypoints of their own, between which lines are drawn
@@ -44,11 +42,14 @@ ZERO = np.zeros(3)
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """All combinations of ``axes`` and ``origins`` (one or two things) for demonstrations in ``scene``."""
+    """All combinations of ``axes`` and ``origins`` for demonstrations in ``scene``.
+
+    An origin is one or two things, and those with whose size it moves.
+    """
 
     scene: Scene
     axes: tuple[Axes, ...]
-    origins: tuple[tuple[Thing, ...], ...]
+    origins: tuple[tuple[tuple[Thing, ...], tuple[Thing, ...]], ...]
     growing: tuple[Thing, ...]
 
     @classmethod
@@ -67,12 +68,13 @@ class Candidates:
                 axes.append(replace(line, in_space=True))
         singles = [(thing,) for thing in (*still, *points, *(t for t in things if t.kind == "hinged"))]
         growing = tuple(thing for thing in things if thing.kind == "scaled")
-        return cls(scene, tuple(axes), (*singles, *pairs), growing)
+        ways = [(ends, grows) for ends in (*singles, *pairs) for grows in dict.fromkeys(((), growing))]
+        return cls(scene, tuple(axes), tuple(ways), growing)
 
     def start(self, home: FloatArray) -> FloatArray:
         """o ``(N, I, 3)`` of each origin; the world's is ``home (3,)``."""
-        first = np.stack([self.scene[origin[0]].position for origin in self.origins])
-        first[[origin[0] is WORLD for origin in self.origins]] += home
+        first = np.stack([self.scene[ends[0]].position for ends, _ in self.origins])
+        first[[ends[0] is WORLD for ends, _ in self.origins]] += home
         return first
 
     def design(self, home: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -80,7 +82,7 @@ class Candidates:
         start, scene = self.start(home), self.scene
         num, demos = start.shape[:2]
         fixed = np.zeros((num, demos, 3, 7))
-        for index, origin in enumerate(self.origins):
+        for index, (origin, _) in enumerate(self.origins):
             if origin[0].turns and len(origin) == 2:
                 fixed[index, ..., 1:4] = scene[origin[0]].rotation
             if len(origin) == 2:
@@ -91,11 +93,9 @@ class Candidates:
                 fixed[index, ..., 4:7] = scene[origin[0]].rotation
         rotation = self.rotations()
         sizes = [(scene[thing].size - 1)[:, None, None] * rotation for thing in self.growing]
-        moved = np.concatenate([rotation, *sizes], axis=-1)
-        parts = (
-            np.broadcast_to(fixed, (len(rotation), *fixed.shape)),
-            np.broadcast_to(moved[:, None], (len(rotation), num, *moved.shape[1:])),
-        )
+        moved = np.repeat(np.concatenate([rotation, *sizes], axis=-1)[:, None], num, axis=1)
+        moved[:, [not grows for _, grows in self.origins], ..., 3:] = 0.0
+        parts = np.broadcast_to(fixed, (len(rotation), *fixed.shape)), moved
         deviations = [SHARE_STD, *[POINT_STD_M] * 6, *[OFFSET_STD_M] * 3, *[GROWTH_STD_M] * (3 * len(self.growing))]
         return np.concatenate(parts, axis=-1), (NOISE_M / np.array(deviations)) ** 2
 
@@ -152,7 +152,7 @@ def _guess(candidates: Candidates, offset: FloatArray, demos: int) -> FloatArray
     distance = np.linalg.norm(offset, axis=2)  # (N, I, T)
     noise = np.full(distance.shape, NOISE_M**2)
     suits = np.zeros((len(candidates.axes), len(candidates.origins)))
-    for index, (thing, *_) in enumerate(candidates.origins):
+    for index, ((thing, *_), _) in enumerate(candidates.origins):
         if thing.shape is not None:
             radius = ((thing.shape - thing.shape.mean(axis=0)) ** 2).sum()
             noise[index] = NOISE_M**2 * (1 / len(thing.shape) + distance[index] ** 2 / radius)
@@ -252,7 +252,7 @@ def _fitted(
     start, (design, penalty) = candidates.start(home), candidates.design(home)
     frames = []
     for step, (m, n) in enumerate(picks):
-        origin, x = candidates.origins[n], design[m, n]
+        (origin, grows), x = candidates.origins[n], design[m, n]
         target = centre[:, step] - start[n]
         weight = np.ones(len(hands))
         for _ in range(5):
@@ -265,16 +265,7 @@ def _fitted(
         if origin[0] is WORLD:
             shifts[0] = (1 - share) * home
         grown = w[10:].reshape(-1, 3)
-        growth = tuple(
-            (thing, offset) for thing, offset in zip(candidates.growing, grown, strict=True) if np.abs(offset).max() > 0
-        )
+        growth = tuple(zip(grows, grown, strict=False))
         error = float(np.sqrt(np.median(errors.squared[step, m, n])))
         frames.append(Frame(candidates.axes[m], origin, tuple(shifts), share, growth, error))
     return frames
-
-
-def adaptive_frames(keypoints: FloatArray, hands: FloatArray, key_steps: Sequence[int]) -> list[list[Frame]]:
-    """The frames ``[arm][step]`` for demonstrations with ``keypoints (I, K, 3)`` and ``hands (I, T, A, 3, 3)``."""
-    things = find_things(keypoints)
-    scene = locate([WORLD, *things], keypoints)
-    return [choose_frames(things, scene, hands[:, :, arm], key_steps) for arm in range(hands.shape[2])]

@@ -10,6 +10,7 @@ from robust_instant_policy.context.alignment import align
 from robust_instant_policy.context.codec import MM
 from robust_instant_policy.context.factorised import informative_inputs
 from robust_instant_policy.context.step_frames import StepFrames
+from robust_instant_policy.context.things import find_things
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
@@ -33,7 +34,7 @@ def leave_one_out(
     if len(actions) < MIN_DEMOS:
         return np.full_like(errors, np.nan)
     if frames is None or len(frames.arms[0]) != actions.shape[1]:
-        frames = StepFrames.adaptive(keypoints, actions, aligned.key_steps)
+        frames = StepFrames.adaptive(keypoints, actions, aligned.key_steps, find_things(keypoints))
     numbers = np.stack([frames.encode(points, own) for points, own in zip(keypoints, actions, strict=True)])
     shown = np.stack([frames.inputs(points) for points in keypoints])  # (I, T, A, 3·K)
     for column, step in enumerate(aligned.key_steps):

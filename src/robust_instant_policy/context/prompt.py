@@ -46,6 +46,20 @@ class Prompt(ABC):
     variation: FloatArray | None
     order: Order
 
+    @property
+    def ways(self) -> tuple[Prompt, ...]:
+        """One prompt for each way to act that the demonstrations show; itself where all do the same."""
+        return (self,)
+
+    def for_scene(self, keypoints: FloatArray) -> Prompt:
+        """The prompt of the way that applies in the scene of ``keypoints (K, 3)``."""
+        return self
+
+    def vote(self, keypoints: FloatArray) -> float:
+        """How clearly one way applies in the scene of ``keypoints (K, 3)``: 1 as clearly as in the demonstrations, 0 not
+        at all."""
+        return 1.0
+
     @abstractmethod
     def queries(self, keypoints: FloatArray) -> list[Query]:
         """What to ask for a scene with ``keypoints (K, 3)``, metres."""
@@ -60,7 +74,8 @@ class Prompt(ABC):
 
     def by_distance(self, keypoints: FloatArray) -> list[int]:
         """Indices of the demonstrations by their keypoints' mean distance from ``keypoints (K, 3)``, furthest first."""
-        distances = np.linalg.norm(self.keypoints - keypoints, axis=-1).mean(axis=-1)
+        named = np.stack([self.frames.named(points) for points in self.keypoints])
+        distances = np.linalg.norm(named - self.frames.named(keypoints), axis=-1).mean(axis=-1)
         return sorted(range(len(distances)), key=lambda demo: -distances[demo])
 
     def ordered(self, examples: Sequence[str], keypoints: FloatArray) -> str:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from robust_instant_policy.context.codec import MM
-from robust_instant_policy.context.choice import adaptive_frames
+from robust_instant_policy.context.choice import choose_frames
 from robust_instant_policy.context.frames import WORLD_FRAME, Frame
-from robust_instant_policy.context.things import locate
+from robust_instant_policy.context.things import WORLD, Thing, locate
+from robust_instant_policy.context.ways import Order
 from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
@@ -24,18 +25,26 @@ class StepFrames:
     """
 
     arms: tuple[tuple[Frame, ...], ...]
+    order: Order | None = None
 
     @classmethod
     def world(cls, num_steps: int, num_arms: int) -> StepFrames:
         return cls(((WORLD_FRAME,) * num_steps,) * num_arms)
 
     @classmethod
-    def adaptive(cls, keypoints: FloatArray, actions: FloatArray, key_steps: Sequence[int]) -> StepFrames:
-        """The frames in which demonstrations with ``keypoints (I, K, 3)``, aligned ``actions (I, T, 10·A)``, agree
-        best; ``key_steps`` count more (see `choose_frames`)."""
-        points = actions.reshape(*actions.shape[:2], -1, ACTION_DIM)[..., :STATE_INDEX]
-        hands = points.reshape(*points.shape[:-1], 3, 3)
-        return cls(tuple(map(tuple, adaptive_frames(keypoints, hands, key_steps))))
+    def adaptive(
+        cls,
+        keypoints: FloatArray,
+        actions: FloatArray,
+        key_steps: Sequence[int],
+        things: Sequence[Thing],
+        order: Order | None = None,
+    ) -> StepFrames:
+        """The frames in which demonstrations with ``keypoints (I, K, 3)``, named in ``order``, and aligned ``actions
+        (I, T, 10·A)`` predict each other best; ``key_steps`` count more (see `choose_frames`)."""
+        scene, hands = locate([WORLD, *things], keypoints), hands_of(actions)
+        frames = (choose_frames(things, scene, hands[:, :, arm], key_steps) for arm in range(hands.shape[2]))
+        return cls(tuple(map(tuple, frames)), order)
 
     @property
     def num_arms(self) -> int:
@@ -43,9 +52,14 @@ class StepFrames:
 
     def poses(self, keypoints: FloatArray) -> FloatArray:
         """Pose of each step's frame ``(T, A, 4, 4)`` in the scene of ``keypoints (K, 3)``."""
+        keypoints = self.named(keypoints)
         frames = [frame for of_step in zip(*self.arms, strict=True) for frame in of_step]
         scene = locate({thing: None for frame in frames for thing in frame.things}, keypoints[None])
         return np.stack([frame.pose_in(scene)[0] for frame in frames]).reshape(-1, self.num_arms, 4, 4)
+
+    def named(self, keypoints: FloatArray) -> FloatArray:
+        """``keypoints (K, 3)`` by the names that they have in the frames."""
+        return keypoints if self.order is None else self.order.renamed(keypoints[None])[0]
 
     def encode(self, keypoints: FloatArray, actions: FloatArray) -> FloatArray:
         """The numbers ``(T, 10·A)`` of ``actions (T, 10·A)`` in the scene of ``keypoints (K, 3)``."""
@@ -73,8 +87,15 @@ class StepFrames:
     def inputs(self, keypoints: FloatArray) -> FloatArray:
         """``keypoints (K, 3)`` in each step's frame, millimetres ``(T, A, 3·K)``."""
         poses = self.poses(keypoints)
-        shown = [MM * transform_points(invert_pose(pose), keypoints).ravel() for pose in poses.reshape(-1, 4, 4)]
+        named = self.named(keypoints)
+        shown = [MM * transform_points(invert_pose(pose), named).ravel() for pose in poses.reshape(-1, 4, 4)]
         return np.reshape(shown, (*poses.shape[:2], -1))
+
+
+def hands_of(actions: FloatArray) -> FloatArray:
+    """The gripper's three points ``(..., A, 3, 3)`` of ``actions (..., 10·A)``."""
+    points = actions.reshape(*actions.shape[:-1], -1, ACTION_DIM)[..., :STATE_INDEX]
+    return points.reshape(*points.shape[:-1], 3, 3)
 
 
 def _points(numbers: FloatArray) -> FloatArray:

@@ -14,12 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.geometry import FloatArray, fit_rigid, fit_upright, rotations_about_vertical
 
-RIGID_SPREAD_M = 0.010  # keypoints whose distance varies less than this belong to the same thing
+RIGID_SPREADS = 3.5  # keypoints whose distance varies by so many times the smallest variation belong to the same thing,
+RIGID_SPREAD_M = (0.006, 0.015)  # within these limits
 DEMOS_TO_TELL_THINGS = 3  # with fewer, all distances look constant
 DEMOS_FOR_MEDIANS = 5  # with fewer, an outlier cannot be identified
 OUTLIER_M = 0.006  # residual at which a keypoint's influence on a fitted pose is halved
 SHAPE_TOLERANCE = 0.15  # of a thing's size: how far its shape may vary beside its size
 LEAST_SWING_RAD = 0.2  # a part that turns less than this shows no hinge
+LEAST_SCALED = 4  # keypoints of a thing of varying size: two define it
+SIZE_EXPLAINS = 0.7  # relative spread of distances when divided by the size, below which a thing has one
 MAX_THINGS = 4  # of several keypoints: those of the most keypoints
 MAD_TO_STD = 1.4826
 
@@ -72,6 +75,10 @@ class Located:
     rotation: FloatArray
     position: FloatArray
     size: FloatArray
+
+    def of(self, scenes: np.ndarray) -> Located:
+        """The thing in those of the ``scenes`` alone."""
+        return Located(self.rotation[scenes], self.position[scenes], self.size[scenes])
 
     def point(self, offset: FloatArray) -> FloatArray:
         """``(I, 3)``, the world positions of the point ``offset (3,)`` of the thing."""
@@ -134,19 +141,27 @@ def find_things(keypoints: FloatArray) -> list[Thing]:
         groups = [tuple(sorted(node.pre_order())) for node in nodes if not node.is_leaf()]
         return [*_solid(groups, keypoints), *(Thing("point", (k,)) for k in range(num_points))]
     varies = spread(distances)
-    tree = linkage(squareform(varies, checks=False), "average")
-    labels = fcluster(tree, RIGID_SPREAD_M, "distance")
-    clusters = [tuple(map(int, np.flatnonzero(labels == label))) for label in np.unique(labels)]
-    solid = [cluster for cluster in clusters if len(cluster) >= 3]
-    loose = sorted(set(range(num_points)).difference(*solid))
-    scaled = _scaled(keypoints, loose)
+    least = np.median(np.where(np.eye(num_points, dtype=bool), np.inf, varies).min(axis=1))
+    tolerance = float(np.clip(RIGID_SPREADS * least, *RIGID_SPREAD_M))
+    clusters = _clusters(varies, tolerance)
+    scaled = [thing for thing in _scaled(keypoints, tolerance) if _outnumbers(thing.members, clusters)]
     taken = {member for thing in scaled for member in thing.members}
-    pairs = [cluster for cluster in clusters if len(cluster) == 2 and taken.isdisjoint(cluster)]
-    groups = sorted([*solid, *pairs], key=lambda group: -len(group))[:MAX_THINGS]
-    things = _solid(groups, keypoints) + scaled
-    things += _hinged(things, keypoints)
+    groups = [group for group in clusters if len(group) > 1 and taken.isdisjoint(group)]
+    things = _solid(sorted(groups, key=lambda group: -len(group))[:MAX_THINGS], keypoints) + scaled
+    things += _hinged(things, keypoints, tolerance)
     known = {member for thing in things for member in thing.members}
     return things + [Thing("point", (k,)) for k in range(num_points) if k not in known]
+
+
+def _clusters(varies: FloatArray, tolerance: float) -> list[tuple[int, ...]]:
+    """Groups of keypoints all of whose distances vary less than ``tolerance``."""
+    labels = fcluster(linkage(squareform(varies, checks=False), "complete"), tolerance, "distance")
+    return [tuple(map(int, np.flatnonzero(labels == label))) for label in np.unique(labels)]
+
+
+def _outnumbers(members: tuple[int, ...], clusters: Sequence[tuple[int, ...]]) -> bool:
+    """Whether more keypoints keep their shape than their distances."""
+    return all(len(members) > len(cluster) for cluster in clusters if not set(cluster).isdisjoint(members))
 
 
 def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray) -> list[Thing]:
@@ -155,31 +170,35 @@ def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray) -> list[Thi
     return things + [Thing("rigid", group, _mean_shape(keypoints[:, list(group)], False)) for group in flat]
 
 
-def _scaled(keypoints: FloatArray, loose: Sequence[int]) -> list[Thing]:
-    """Things among the ``loose`` keypoints that keep their shape, seen from above, but not their size.
+def _scaled(keypoints: FloatArray, tolerance: float) -> list[Thing]:
+    """Things that keep their shape, seen from above, but not their size.
 
     Two keypoints define a position, a turn and a size; others belong to them where these predict where they are.
     """
     things: list[Thing] = []
-    loose = list(loose)
-    while len(loose) >= 3:
+    loose = list(range(keypoints.shape[1]))
+    while len(loose) >= LEAST_SCALED:
         z = _complex(keypoints[:, loose])
         apart = z[:, None, :] - z[:, :, None]  # from j to k
         length = np.abs(apart).mean(axis=0)
         relative = (z[:, None, None, :] - z[:, :, None, None]) / (apart + np.eye(len(loose)))[..., None]
         scatter = np.hypot(spread(relative.real), spread(relative.imag)) * length[..., None]  # (j, k, member)
-        fits = scatter < np.maximum(SHAPE_TOLERANCE * length, RIGID_SPREAD_M)[..., None]
+        near = np.minimum(length[:, None], length[None])  # of a member to j or k
+        fits = scatter < np.maximum(SHAPE_TOLERANCE * near, tolerance)
         fits[np.eye(len(loose), dtype=bool)] = False
-        count = fits.sum(axis=-1) - (scatter * fits).sum(axis=-1) / (length + 1e-9) / len(loose)
+        count = fits.sum(axis=-1) - (scatter * fits).sum(axis=-1)
         j, k = np.unravel_index(int(np.argmax(count)), count.shape)
         members = tuple(loose[index] for index in np.flatnonzero(fits[j, k]))
-        if len(members) < 3:
+        if len(members) < LEAST_SCALED:
             break
         loose = [k for k in loose if k not in members]
         points = keypoints[:, list(members)]
         size = _rms_radius(points)
-        unit = points * (size.mean() / size)[:, None, None]
-        things.append(Thing("scaled", members, _mean_shape(unit, True)))
+        distances = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
+        relative = distances * (size.mean() / size)[:, None, None]
+        if spread(relative).sum() < SIZE_EXPLAINS * spread(distances).sum():
+            unit = points * (size.mean() / size)[:, None, None]
+            things.append(Thing("scaled", members, _mean_shape(unit, True)))
     return things
 
 
@@ -188,7 +207,7 @@ def _rms_radius(points: FloatArray) -> FloatArray:
     return np.sqrt((flat**2).sum(axis=-1).mean(axis=-1))
 
 
-def _hinged(things: Sequence[Thing], keypoints: FloatArray) -> list[Thing]:
+def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) -> list[Thing]:
     """Rigid things that turn about an axis fixed in another one or in the world, at shares of their angle."""
     rigid = {thing.members: thing for thing in things if thing.kind == "rigid"}
     bases = [WORLD, *(thing for thing in things if thing.kind in ("upright", "rigid"))]
@@ -200,6 +219,7 @@ def _hinged(things: Sequence[Thing], keypoints: FloatArray) -> list[Thing]:
             for base in bases
             if base.members != members
             for error, hinge, shape in _hinge(base, found[base], found[part], keypoints[:, list(members)])
+            if error < tolerance
         ]
         if fits:
             _, hinge, shape = min(fits, key=lambda fit: fit[0])
@@ -236,7 +256,7 @@ def _hinge(
     shape = np.median(local @ rotations_about_vertical(angle), axis=0)
     predicted = shape @ np.swapaxes(rotations_about_vertical(angle), -1, -2)
     error = float(np.sqrt(np.median(((predicted - local) ** 2).sum(axis=-1))))
-    return [(error, Hinge(base, center, frame), shape)] if error < RIGID_SPREAD_M else []
+    return [(error, Hinge(base, center, frame), shape)]
 
 
 def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArray:
