@@ -34,7 +34,8 @@ SHARE_STD, POINT_STD_M, OFFSET_STD_M, GROWTH_STD_M = 0.7, 0.04, 0.5, 0.1
 PARAMETER_COST = 0.02  # of a fitted number, in logarithms of the error
 TRANSITION_COST = 1.0  # of a change of frame between two steps, in logarithms of the error
 KEY_STEP_WEIGHT = 3.0  # of the first and last step and of gripper changes; 1 elsewhere
-DISTANCE_SHARE = 0.05  # error a metre to the thing that is expected of a single demonstration
+# Expected error of a single demonstration, a metre to a thing that is seen in its own axes, and to one that has none.
+DISTANCE_SHARE, UNTURNED_SHARE = 0.05, 0.3
 MAX_LOOSE = 4  # keypoints of their own, between which lines are drawn
 
 ZERO = np.zeros(3)
@@ -159,7 +160,9 @@ def _guess(candidates: Candidates, offset: FloatArray, demos: int) -> FloatArray
         for row, axes in enumerate(candidates.axes):
             own = axes.ends[0].thing
             suits[row, index] = 0.0 if own is thing or (own is WORLD and not thing.turns) else np.inf
-    guess = noise + (DISTANCE_SHARE * distance / demos) ** 2
+    turning = np.array([thing.turns or thing is WORLD for (thing, *_), _ in candidates.origins])
+    share = np.where(turning, DISTANCE_SHARE, UNTURNED_SHARE)[:, None, None]
+    guess = noise + (share * distance / demos) ** 2
     return np.moveaxis(guess, -1, 0)[:, None] + suits[None, :, :, None]
 
 
@@ -243,9 +246,7 @@ def _fitted_line(
     return moved(fit.x)
 
 
-def _fitted(
-    candidates: Candidates, errors: Errors, hands: FloatArray, picks: Sequence[tuple[int, int]]
-) -> list[Frame]:
+def _fitted(candidates: Candidates, errors: Errors, hands: FloatArray, picks: Sequence[tuple[int, int]]) -> list[Frame]:
     """The frames of ``picks`` (axes, origin), one a step, with their numbers fitted robustly to the demonstrations."""
     centre = hands.mean(axis=2)
     home = centre[:, 0].mean(axis=0)

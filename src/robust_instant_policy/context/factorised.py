@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.context.codec import read_rows, row_grammar, row_pattern, write_row
@@ -22,7 +23,7 @@ AGREE_MM = 1.0  # a number on which all demonstrations agree this closely is not
 MIN_DEMOS_TO_AGREE = 3
 INPUTS_PER_QUERY = 2  # keypoint coordinates shown with each example
 NOISE_MM = 5.0  # variation of a keypoint coordinate that carries no information
-STRIDE = 3  # of the steps that are asked for where nothing happens; those between are interpolated
+INTERPOLATED_MM = 2.0  # a step whose numbers follow from its neighbours this closely is not asked for
 LEVER_MM = 100.0  # distance at which turns are written as lengths
 HAND_DIM, HAND_STATE = 7, 6  # numbers of a hand: point, turn, state
 STEPS_PER_QUERY = 4  # neighbouring steps asked for together: they share the examples' inputs
@@ -46,7 +47,7 @@ class Question:
 
 @dataclass(frozen=True, eq=False)
 class FactorisedPrompt(Prompt):
-    """``numbers (I, T, 7·A)`` of the aligned demonstrations ``shown`` (indices), see `as_turns`; queries ask for
+    """``numbers (I, T, 7·A)`` of the aligned demonstrations, see `as_turns`; queries ask for
     differences from their ``median (T, 7·A)``, which is in whole millimetres. Where demonstrations differ in what they do,
     ``parts`` are the prompts of their ways, between which ``split`` decides."""
 
@@ -54,7 +55,6 @@ class FactorisedPrompt(Prompt):
     median: FloatArray
     reference: FloatArray
     questions: tuple[Question, ...]
-    shown: tuple[int, ...]
     split: Split | None = None
     parts: tuple[FactorisedPrompt, ...] = ()
 
@@ -62,10 +62,8 @@ class FactorisedPrompt(Prompt):
     def ways(self) -> tuple[FactorisedPrompt, ...]:
         return self.parts or (self,)
 
-    def for_scene(self, keypoints: FloatArray) -> FactorisedPrompt:
-        if self.split is None:
-            return self
-        return self.parts[self.split.decide(self.frames.named(self.checked(keypoints)))[0]]
+    def way(self, keypoints: FloatArray) -> int:
+        return 0 if self.split is None else self.split.decide(self.frames.named(self.checked(keypoints)))[0]
 
     def vote(self, keypoints: FloatArray) -> float:
         return 1.0 if self.split is None else self.split.decide(self.frames.named(self.checked(keypoints)))[1]
@@ -130,12 +128,15 @@ def as_turns(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Hands ``(I, T, 7·A)``, and the ``reference (T, A, 3, 3)`` from which they turn, of ``numbers (I, T, 10·A)``.
 
     For each arm the point between the fingertips, millimetres; the rotation vector from the reference, in millimetres at
-    `LEVER_MM`; the gripper state. The reference are the demonstrations' median points about that point, see `StepFrames`.
+    `LEVER_MM`; the gripper state. The reference are the points of the most
+    typical demonstration about that point, see `StepFrames`.
     """
     rows = numbers.reshape(*numbers.shape[:2], -1, ACTION_DIM)
     points = rows[..., 3:STATE_INDEX].reshape(*rows.shape[:-1], 2, 3)
     points = np.concatenate([points, -points[..., 1:, :]], axis=-2)  # gripper point, fingertips
-    reference = np.median(points, axis=0)
+    apart = np.linalg.norm(points[:, None] - points, axis=-1).sum(axis=(1, -1))  # (I, T, A), of all others
+    typical = np.argmin(apart, axis=0)
+    reference = np.take_along_axis(points, typical[None, ..., None, None], axis=0)[0]
     rotation = fit_rigid(np.broadcast_to(reference, points.shape), points)[..., :3, :3]
     turns = LEVER_MM * Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec().reshape(rows[..., :3].shape)
     hands = np.concatenate([rows[..., :3], turns, rows[..., STATE_INDEX:]], axis=-1)
@@ -159,18 +160,29 @@ def make_questions(
     questions = (
         _question(arm, steps, numbers - median, shown)
         for arm, own in enumerate(frames.arms)
-        for steps in _blocks(own, key_steps)
+        for steps in _blocks(own, key_steps, (numbers - median)[..., HAND_DIM * arm : HAND_DIM * (arm + 1)])
     )
     return tuple(question for question in questions if question is not None)
 
 
-def _blocks(frames: Sequence[Frame], key_steps: Sequence[int]) -> list[list[int]]:
-    """Steps to ask for together: of each run of frames that continue each other the ends, the key steps, and of the
-    others every `STRIDE`-th; at most `STEPS_PER_QUERY`."""
+def _blocks(frames: Sequence[Frame], key_steps: Sequence[int], offsets: FloatArray) -> list[list[int]]:
+    """Steps to ask for together, at most `STEPS_PER_QUERY`.
+
+    Of each run of frames that continue each other, the key steps, and as many others as give the demonstrations'
+    ``offsets (I, T, 7)`` by interpolation.
+    """
     changes = [step for step in range(1, len(frames)) if not frames[step].continues(frames[step - 1])]
     blocks = []
     for start, stop in pairwise([0, *changes, len(frames)]):
-        asked = sorted({stop - 1, *range(start, stop, STRIDE), *(key for key in key_steps if start <= key < stop)})
+        asked = sorted({start, stop - 1, *(key for key in key_steps if start <= key < stop)})
+        while True:
+            if len(asked) == stop - start:
+                break
+            between = interp1d(asked, offsets[:, asked], axis=1)(np.arange(start, stop))
+            missed = np.abs(between - offsets[:, start:stop]).max(axis=(0, 2))
+            if missed.max() <= INTERPOLATED_MM:
+                break
+            asked = sorted([*asked, start + int(np.argmax(missed))])
         blocks += [list(map(int, part)) for part in np.array_split(asked, -(-len(asked) // STEPS_PER_QUERY))]
     return blocks
 

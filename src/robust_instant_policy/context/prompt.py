@@ -31,7 +31,7 @@ Order = Literal["given", "nearest-last"]
 class Prompt(ABC):
     """Serialised demonstrations; made by `write_prompt`.
 
-    ``keypoints (I, K, 3)``, metres, are those of the demonstrations that are shown, ``frames`` the frame of each step.
+    ``keypoints (I, K, 3)``, metres, are those of the demonstrations ``shown`` (indices), ``frames`` the frame of each step.
     Evenly spread over a trajectory, ``curvature (B,)``, metres, bound how sharply the gripper is expected to
     turn (see `AlignedDemonstrations.curvature`), and ``variation (T,)``, metres, is the demonstrations'
     standard deviation in these frames; None in the world frame, where scenes vary too, and of one demonstration.
@@ -45,15 +45,20 @@ class Prompt(ABC):
     curvature: FloatArray
     variation: FloatArray | None
     order: Order
+    shown: tuple[int, ...]
 
     @property
     def ways(self) -> tuple[Prompt, ...]:
         """One prompt for each way to act that the demonstrations show; itself where all do the same."""
         return (self,)
 
+    def way(self, keypoints: FloatArray) -> int:
+        """Which of ``ways`` applies in the scene of ``keypoints (K, 3)``."""
+        return 0
+
     def for_scene(self, keypoints: FloatArray) -> Prompt:
         """The prompt of the way that applies in the scene of ``keypoints (K, 3)``."""
-        return self
+        return self.ways[self.way(keypoints)]
 
     def vote(self, keypoints: FloatArray) -> float:
         """How clearly one way applies in the scene of ``keypoints (K, 3)``: 1 as clearly as in the demonstrations, 0 not

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robust_instant_policy.context.codec import MM
 from robust_instant_policy.context.choice import choose_frames
+from robust_instant_policy.context.codec import MM
 from robust_instant_policy.context.frames import WORLD_FRAME, Frame
 from robust_instant_policy.context.things import WORLD, Thing, locate
 from robust_instant_policy.context.ways import Order

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -224,9 +224,7 @@ def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) ->
         if fits:
             _, hinge, shape = min(fits, key=lambda fit: fit[0])
             for share in (1.0, 0.25, 0.5, 0.75):
-                hinged.append(
-                    Thing("hinged", members, shape, Hinge(hinge.base, hinge.point, hinge.rotation, share))
-                )
+                hinged.append(Thing("hinged", members, shape, Hinge(hinge.base, hinge.point, hinge.rotation, share)))
     return hinged
 
 
@@ -313,7 +311,7 @@ def _complex(points: FloatArray) -> np.ndarray:
 
 
 def _ranges(members: Sequence[int]) -> str:
-    """"0-4, 7" for 0, 1, 2, 3, 4, 7."""
+    """ "0-4, 7" for 0, 1, 2, 3, 4, 7."""
     runs: list[list[int]] = []
     for member in members:
         if runs and member == runs[-1][-1] + 1:

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from functools import partial
+from itertools import combinations, pairwise, permutations
+from operator import attrgetter
 
 import numpy as np
 
@@ -22,18 +24,18 @@ RANK_GAIN, SPLIT_GAIN = 1.0, 2.0  # sums of logarithms of the errors at key step
 LEAST_OF_A_WAY = 2  # demonstrations
 ALIKE_M = 0.008  # difference of the distances between keypoints of things that are alike
 SINGLE_ERROR_M = 0.010  # where every key step is predicted better than this, all do the same
-CLOSE_VOTE = 0.5  # of the distance from the threshold to the nearest demonstration
-
-Ranks = {"distance from the robot": lambda p: np.hypot(p[..., 0], p[..., 1])}
 
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """One number of a scene, in ``words``; ``value`` maps a `Scene` to ``(I,)``. ``parts`` is how many things it takes."""
+    """One number of a scene, in ``words``: a function of where some ``things`` are, to ``(I,)``."""
 
     words: str
-    parts: int
-    value: Callable[[Scene], FloatArray]
+    things: tuple[Thing, ...]
+    function: Callable[..., FloatArray]
+
+    def value(self, scene: Scene) -> FloatArray:
+        return self.function(*(scene[thing] for thing in self.things))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,30 +56,28 @@ class Order:
         values = np.concatenate([middle, np.linalg.norm(middle[..., :2], axis=-1, keepdims=True)], axis=-1)
         order = np.argsort(values[..., self.axis], axis=1)
         sorted_ = keypoints.copy()
-        sorted_[:, blocks.ravel()] = keypoints[np.arange(len(keypoints))[:, None], blocks[order].reshape(len(order), -1)]
+        sorted_[:, blocks.ravel()] = keypoints[
+            np.arange(len(keypoints))[:, None], blocks[order].reshape(len(order), -1)
+        ]
         return sorted_
 
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Two ways to act: the first where the measure is below ``threshold``. ``gap`` is the distance between the nearest
-    demonstrations on both sides; ``things`` are what it measures."""
+    """Two ways to act: the first where the ``measure`` is below ``threshold``. ``gap`` is the distance between the
+    nearest demonstrations on both sides."""
 
     measure: Measure
-    things: tuple[Thing, ...]
     threshold: float
     gap: float
 
     def __str__(self) -> str:
         return f"two ways, told apart by {self.measure.words} (threshold {self.threshold:.3f})"
 
-    def values(self, keypoints: FloatArray) -> FloatArray:
-        """``(I,)``."""
-        return self.measure.value(locate(self.things, keypoints))
-
     def decide(self, keypoints: FloatArray) -> tuple[int, float]:
         """The way for ``keypoints (K, 3)``, 0 or 1, and the vote in [0, 1]: 1 is as clear as the demonstrations are."""
-        beyond = float(self.values(keypoints[None])[0]) - self.threshold
+        value = self.measure.value(locate(self.measure.things, keypoints[None]))
+        beyond = float(value[0]) - self.threshold
         return int(beyond >= 0), float(min(1.0, abs(beyond) / (self.gap / 2)))
 
 
@@ -108,16 +108,17 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
         return None
     single = _cost(things, scene, hands)
     splits: dict[bytes, list[tuple[float, Split, np.ndarray]]] = {}
-    for measure, own in _measures(things):
+    for measure in _measures(things):
         values = measure.value(scene)
-        ordered = np.sort(values)
-        for low, high in zip(ordered[LEAST_OF_A_WAY - 1 :], ordered[LEAST_OF_A_WAY : demos - LEAST_OF_A_WAY + 1]):
+        ordered = np.sort(values)[LEAST_OF_A_WAY - 1 : demos - LEAST_OF_A_WAY + 1]
+        for low, high in pairwise(ordered):
             gap, deviation = float(high - low), float(values.std())
             if gap > 0.02 * deviation:
                 side = values > (low + high) / 2
                 key = (side if side[0] else ~side).tobytes()
-                split = Split(measure, own, float(low + high) / 2, gap)
-                splits.setdefault(key, []).append((gap / deviation / np.sqrt(measure.parts), split, side))
+                split = Split(measure, float(low + high) / 2, gap)
+                margin = gap / deviation / np.sqrt(len(measure.things))
+                splits.setdefault(key, []).append((margin, split, side))
     best: tuple[float, Split, np.ndarray] | None = None
     for same in splits.values():
         margin, split, side = max(same, key=lambda one: one[0])
@@ -169,7 +170,8 @@ def _alike(things: Sequence[Thing], keypoints: FloatArray) -> tuple[tuple[int, .
 
 def _matched(shape: FloatArray | None, other: FloatArray | None) -> tuple[int, ...] | None:
     """The order of the ``other (N, 3)`` keypoints in which their distances are those of ``shape (N, 3)``."""
-    assert shape is not None and other is not None
+    assert shape is not None
+    assert other is not None
     distances, others = (np.linalg.norm(s[:, None] - s[None], axis=-1) for s in (shape, other))
     orders = np.array(list(permutations(range(len(shape)))))
     difference = np.abs(others[orders[:, :, None], orders[:, None, :]] - distances).max(axis=(1, 2))
@@ -177,37 +179,35 @@ def _matched(shape: FloatArray | None, other: FloatArray | None) -> tuple[int, .
     return tuple(map(int, orders[best])) if difference[best] < ALIKE_M else None
 
 
-def _measures(things: Sequence[Thing]) -> list[tuple[Measure, tuple[Thing, ...]]]:
-    """What may decide: where things are, how they are turned, their size, and how two of them lie to each other."""
+def _measures(things: Sequence[Thing]) -> list[Measure]:
+    """What may decide: where things are, how they are turned, their size, and how two or three lie to each other."""
     own = [thing for thing in things if thing.kind in ("upright", "scaled")]
     points = [thing for thing in things if thing.kind == "point"]
     own += points if len(own) + len(points) <= 4 else []
-    found: list[tuple[Measure, tuple[Thing, ...]]] = []
-
-    def add(words: str, parts: tuple[Thing, ...], value: Callable[[Scene], FloatArray]) -> None:
-        found.append((Measure(words, len(parts), value), parts))
-
+    found: list[Measure] = []
     for a in own:
-        for axis, name in enumerate("xyz"):
-            add(f"{name} of {a}", (a,), lambda s, a=a, axis=axis: s[a].position[:, axis])
-        add(f"the distance of {a} from the robot", (a,), lambda s, a=a: _far(s[a]))
+        found += [Measure(f"{name} of {a}", (a,), place) for name, place in _PLACES.items()]
         if a.turns:
-            add(f"the turn of {a}", (a,), lambda s, a=a: _yaw(s[a]))
+            found.append(Measure(f"the turn of {a}", (a,), _yaw))
         if a.kind == "scaled":
-            add(f"the size of {a}", (a,), lambda s, a=a: s[a].size)
+            found.append(Measure(f"the size of {a}", (a,), attrgetter("size")))
     for a, b in combinations(own, 2):
-        for axis, name in enumerate("xyz"):
-            add(f"{name} of {a} minus that of {b}", (a, b),
-                lambda s, a=a, b=b, axis=axis: s[a].position[:, axis] - s[b].position[:, axis])  # fmt: skip
-        add(f"how much further than {b} {a} is", (a, b), lambda s, a=a, b=b: _far(s[a]) - _far(s[b]))
+        found += [
+            Measure(f"{name} of {a} minus that of {b}", (a, b), partial(_difference, place))
+            for name, place in _PLACES.items()
+        ]
     for a, b in permutations(own, 2):
         if a.turns:
-            for axis, name in enumerate("xy"):
-                add(f"{name} of {b} in the axes of {a}", (a, b),
-                    lambda s, a=a, b=b, axis=axis: _seen_from(s[a], s[b])[:, axis])  # fmt: skip
-    for a, b, c in combinations(own, 3):
-        add(f"the side of {c} on which {a} and {b} are", (a, b, c), lambda s, a=a, b=b, c=c: _side(s[a], s[b], s[c]))
+            found.append(Measure(f"how far {b} is along the x axis of {a}", (a, b), _ahead))
+            found.append(Measure(f"how far {b} is along the y axis of {a}", (a, b), _aside))
+    for parts in combinations(own, 3):
+        words = "the side of the line from {} to {} on which {} is".format(*parts)
+        found.append(Measure(words, parts, _side))
     return found
+
+
+def _difference(place: Callable[[Located], FloatArray], at: Located, other: Located) -> FloatArray:
+    return place(at) - place(other)
 
 
 def _far(at: Located) -> FloatArray:
@@ -219,11 +219,23 @@ def _yaw(at: Located) -> FloatArray:
     return np.arctan2(at.rotation[:, 1, 0], at.rotation[:, 0, 0])
 
 
-def _seen_from(at: Located, other: Located) -> FloatArray:
-    return ((other.position - at.position)[:, None] @ at.rotation)[:, 0]
+def _ahead(at: Located, other: Located) -> FloatArray:
+    return ((other.position - at.position) * at.rotation[:, :, 0]).sum(axis=1)
+
+
+def _aside(at: Located, other: Located) -> FloatArray:
+    return ((other.position - at.position) * at.rotation[:, :, 1]).sum(axis=1)
 
 
 def _side(a: Located, b: Located, c: Located) -> FloatArray:
     """Distance of c from the line from a to b, positive on its left."""
     line, off = (b.position - a.position)[:, :2], (c.position - a.position)[:, :2]
     return (line[:, 0] * off[:, 1] - line[:, 1] * off[:, 0]) / np.linalg.norm(line, axis=1)
+
+
+_PLACES: dict[str, Callable[[Located], FloatArray]] = {
+    "x": lambda at: at.position[:, 0],
+    "y": lambda at: at.position[:, 1],
+    "z": lambda at: at.position[:, 2],
+    "the distance from the robot": _far,
+}

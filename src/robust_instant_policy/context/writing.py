@@ -59,6 +59,7 @@ def write_prompt(
             np.full_like(aligned.curvature(), aligned.curvature().max()),
             variation=None,
             order=order,
+            shown=tuple(range(len(keypoints))),
             examples=tuple(sequence_example(points, rows) for points, rows in pairs),
             lengths=(min(lengths), max(lengths)),
             raw=True,
@@ -83,7 +84,15 @@ def _sequence(keypoints: FloatArray, aligned: AlignedDemonstrations, frames: Fra
     pairs = zip(keypoints, np.round(numbers), strict=True)
     examples = tuple(sequence_example(points, rows) for points, rows in pairs)
     return SequencePrompt(
-        keypoints, chosen, aligned.curvature(), variation, order, examples, lengths=(steps, steps), raw=False
+        keypoints,
+        chosen,
+        aligned.curvature(),
+        variation,
+        order,
+        aligned.kept,
+        examples,
+        lengths=(steps, steps),
+        raw=False,
     )
 
 
@@ -126,9 +135,9 @@ def _factorised(
         aligned.curvature(),
         variation,
         order,
+        tuple(aligned.kept[index] for index in shown),
         hands,
         median,
         reference,
         questions,
-        tuple(aligned.kept[index] for index in shown),
     )

@@ -24,7 +24,8 @@ def aggregate(context: Context, scene: LocatedScene, proposal: Proposal, setting
     """
     watch = Stopwatch()
     with watch.stage("regression"):
-        robust = agree(proposal, settings, context.prompt.curvature, context.prompt.variation)
+        prompt = context.prompt.for_scene(scene.keypoints)
+        robust = agree(proposal, settings, prompt.curvature, prompt.variation)
     return make_plan(context, scene, proposal, robust, watch.stages, judged=True)
 
 

@@ -103,7 +103,7 @@ def context_of_keypoints(keypoints: FloatArray, trajectories: Sequence[Trajector
         thinned,
         prompt,
         SetReport((), Envelope.of(trajectories, HORIZONTAL), None),
-        leave_one_out(keypoints, thinned, prompt.frames if settings.frames == "adaptive" else None),
+        leave_one_out(keypoints, thinned, prompt),
         (),
     )
 
