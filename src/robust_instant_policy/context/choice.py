@@ -30,8 +30,8 @@ from robust_instant_policy.geometry import FloatArray
 
 NOISE_M = 0.003  # of demonstrated points in a frame that suits them
 # Standard deviations a priori of what is fitted: share of the way; a point in a thing, an offset, its growth in metres.
-SHARE_STD, POINT_STD_M, OFFSET_STD_M, GROWTH_STD_M = 0.7, 0.04, 0.5, 0.1
-PARAMETER_COST = 0.02  # of a fitted number, in logarithms of the error
+SHARE_STD, POINT_STD_M, OFFSET_STD_M, GROWTH_STD_M = 0.7, 0.02, 0.5, 0.1
+PARAMETER_COST = 0.04  # of a fitted number, in logarithms of the error
 TRANSITION_COST = 1.0  # of a change of frame between two steps, in logarithms of the error
 KEY_STEP_WEIGHT = 3.0  # of the first and last step and of gripper changes; 1 elsewhere
 # Expected error of a single demonstration, a metre to a thing that is seen in its own axes, and to one that has none.
@@ -57,7 +57,9 @@ class Candidates:
     def of(cls, things: Sequence[Thing], scene: Scene) -> Candidates:
         still = [WORLD, *(thing for thing in things if thing.kind in ("upright", "scaled"))]
         points = [thing for thing in things if thing.kind == "point"]
-        ends = still + (points if len(points) <= MAX_LOOSE else [])
+        sized = {member for thing in things if thing.kind == "scaled" for member in thing.members}
+        loose = [point for point in points if sized.isdisjoint(point.members)]
+        ends = still + (loose if len(loose) <= MAX_LOOSE else [])
         few = len(scene[WORLD].size) < DEMOS_TO_TELL_THINGS
         pairs = [] if few else list(combinations(ends, 2))
         axes = [Axes((Anchor(thing, ZERO),)) for thing in (WORLD, *things) if thing is WORLD or thing.turns]

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage, to_tree
+from scipy.optimize import least_squares
 from scipy.spatial.distance import squareform
 from scipy.spatial.transform import Rotation
 
@@ -149,7 +150,7 @@ def find_things(keypoints: FloatArray) -> list[Thing]:
     groups = [group for group in clusters if len(group) > 1 and taken.isdisjoint(group)]
     things = _solid(sorted(groups, key=lambda group: -len(group))[:MAX_THINGS], keypoints) + scaled
     things += _hinged(things, keypoints, tolerance)
-    known = {member for thing in things for member in thing.members}
+    known = {member for thing in things if thing.kind != "scaled" for member in thing.members}
     return things + [Thing("point", (k,)) for k in range(num_points) if k not in known]
 
 
@@ -231,9 +232,10 @@ def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) ->
 def _hinge(
     base: Thing, base_at: Located, part_at: Located, points: FloatArray
 ) -> list[tuple[float, Hinge, FloatArray]]:
-    """The part's error (metres) as a part of ``base``, the hinge, and its shape about it; none where there is no hinge.
+    """The part's error (metres) as a part of ``base``, the hinge, and its shape about it; none where nothing swings.
 
-    Relative rotations about one axis have parallel rotation vectors, and their fixed points lie on the axis.
+    Relative rotations about one axis have parallel rotation vectors, and their fixed points lie on the axis: a first
+    guess, which is then fitted to the part's ``points (I, N, 3)``.
     """
     back = np.swapaxes(base_at.rotation, -1, -2)
     rotation = back @ part_at.rotation
@@ -246,15 +248,30 @@ def _hinge(
     turn = Rotation.from_rotvec(np.outer(swings @ axis, axis)).as_matrix()
     # t_i = c + turn_i (t - c): linear in c and t
     system = np.concatenate([np.eye(3) - turn, turn], axis=2).reshape(-1, 6)
-    center = np.linalg.lstsq(system, position.ravel(), rcond=1e-3)[0][:3]
-    frame = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    center = np.linalg.lstsq(system, position.ravel(), rcond=1e-2)[0][:3]
+    frame = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])[0]
     local = (points - base_at.position[:, None]) @ base_at.rotation
-    local = (local - center) @ frame
-    angle = swings @ axis
-    shape = np.median(local @ rotations_about_vertical(angle), axis=0)
-    predicted = shape @ np.swapaxes(rotations_about_vertical(angle), -1, -2)
-    error = float(np.sqrt(np.median(((predicted - local) ** 2).sum(axis=-1))))
-    return [(error, Hinge(base, center, frame), shape)]
+
+    def residuals(x: FloatArray) -> FloatArray:
+        seen, turned = _about_axis(local, center + x[3:], (frame * Rotation.from_rotvec(x[:3])).as_matrix())
+        return np.append(((seen - turned) / OUTLIER_M).ravel(), 0.01 * x)  # turning or moving along the axis is free
+
+    x = least_squares(residuals, np.zeros(6), loss="soft_l1", max_nfev=20).x
+    hinge = Hinge(base, center + x[3:], (frame * Rotation.from_rotvec(x[:3])).as_matrix())
+    seen, turned = _about_axis(local, hinge.point, hinge.rotation)
+    error = float(np.sqrt(np.median(_squared(seen - turned))))
+    return [(error, hinge, turned[0])]
+
+
+def _about_axis(local: FloatArray, point: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``local (I, N, 3)`` in the axes of a hinge, and the same for a rigid part that turns about its z."""
+    seen = (local - point) @ rotation
+    shape = seen[0]
+    for _ in range(2):
+        angle = np.angle((np.conj(_complex(shape)) * _complex(seen)).sum(axis=1))
+        shape = (seen @ rotations_about_vertical(angle)).mean(axis=0)
+    turned = shape @ np.swapaxes(rotations_about_vertical(angle), -1, -2)
+    return seen, turned
 
 
 def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArray:

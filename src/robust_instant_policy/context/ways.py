@@ -16,13 +16,13 @@ from operator import attrgetter
 
 import numpy as np
 
-from robust_instant_policy.context.choice import Candidates, prediction_errors
+from robust_instant_policy.context.choice import NOISE_M, Candidates, prediction_errors
 from robust_instant_policy.context.things import WORLD, Located, Scene, Thing, find_things, locate
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, fit_upright
 
-RANK_GAIN, SPLIT_GAIN = 1.0, 2.0  # sums of logarithms of the errors at key steps by which an explanation must be better
+RANK_GAIN, SPLIT_GAIN = 1.0, 3.5  # sums of logarithms of the errors at key steps by which an explanation must be better
 LEAST_OF_A_WAY = 2  # demonstrations
-ALIKE_M = 0.008  # difference of the distances between keypoints of things that are alike
+ALIKE_M = 0.006  # largest difference of the shapes of things that are alike
 SINGLE_ERROR_M = 0.010  # where every key step is predicted better than this, all do the same
 
 
@@ -113,7 +113,7 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
         ordered = np.sort(values)[LEAST_OF_A_WAY - 1 : demos - LEAST_OF_A_WAY + 1]
         for low, high in pairwise(ordered):
             gap, deviation = float(high - low), float(values.std())
-            if gap > 0.02 * deviation:
+            if min(gap, deviation / 4) > NOISE_M:
                 side = values > (low + high) / 2
                 key = (side if side[0] else ~side).tobytes()
                 split = Split(measure, float(low + high) / 2, gap)
@@ -169,12 +169,14 @@ def _alike(things: Sequence[Thing], keypoints: FloatArray) -> tuple[tuple[int, .
 
 
 def _matched(shape: FloatArray | None, other: FloatArray | None) -> tuple[int, ...] | None:
-    """The order of the ``other (N, 3)`` keypoints in which their distances are those of ``shape (N, 3)``."""
+    """The order of the ``other (N, 3)`` keypoints in which they have the ``shape (N, 3)``."""
     assert shape is not None
     assert other is not None
-    distances, others = (np.linalg.norm(s[:, None] - s[None], axis=-1) for s in (shape, other))
     orders = np.array(list(permutations(range(len(shape)))))
-    difference = np.abs(others[orders[:, :, None], orders[:, None, :]] - distances).max(axis=(1, 2))
+    moved = other[orders]  # (orders, N, 3)
+    poses = fit_upright(moved, np.broadcast_to(shape, moved.shape), np.ones(moved.shape[:2]))
+    fitted = moved @ np.swapaxes(poses[:, :3, :3], -1, -2) + poses[:, None, :3, 3]
+    difference = np.linalg.norm(fitted - shape, axis=-1).max(axis=1)
     best = int(np.argmin(difference))
     return tuple(map(int, orders[best])) if difference[best] < ALIKE_M else None
 
@@ -182,7 +184,8 @@ def _matched(shape: FloatArray | None, other: FloatArray | None) -> tuple[int, .
 def _measures(things: Sequence[Thing]) -> list[Measure]:
     """What may decide: where things are, how they are turned, their size, and how two or three lie to each other."""
     own = [thing for thing in things if thing.kind in ("upright", "scaled")]
-    points = [thing for thing in things if thing.kind == "point"]
+    taken = {member for thing in own for member in thing.members}
+    points = [thing for thing in things if thing.kind == "point" and taken.isdisjoint(thing.members)]
     own += points if len(own) + len(points) <= 4 else []
     found: list[Measure] = []
     for a in own:
