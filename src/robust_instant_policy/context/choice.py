@@ -109,11 +109,21 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """What each combination predicts: ``cost (T, M, N)`` is the mean logarithm of its error, with the costs of its
-    parameters; ``squared (T, M, N, I)``, square metres, of each demonstration from the others."""
+    """What each combination predicts: ``squared (T, M, N, I)``, square metres, is the error of each demonstration from
+    the others, ``penalty (M, N)`` the cost of its fitted numbers, in logarithms of the error."""
 
-    cost: FloatArray
     squared: FloatArray
+    penalty: FloatArray
+
+    @property
+    def cost(self) -> FloatArray:
+        """``(T, M, N)``: the mean logarithm of the error, on which a single bad demonstration has little influence."""
+        return 0.5 * np.log(self.squared + NOISE_M**2).mean(axis=-1) + self.penalty
+
+    @property
+    def mean_squared(self) -> FloatArray:
+        """``(T, M, N)``, square metres, raised by the cost: every demonstration has to be explained."""
+        return self.squared.mean(axis=-1) * np.exp(2 * self.penalty)
 
 
 def prediction_errors(candidates: Candidates, hands: FloatArray) -> Errors:
@@ -145,8 +155,7 @@ def prediction_errors(candidates: Candidates, hands: FloatArray) -> Errors:
     else:
         expected = np.trace(hat, axis1=-2, axis2=-1) + 2 * np.array([[len(axes.ends) - 1] for axes in candidates.axes])
         expected = expected + np.array([[axes.ends[0].thing is not WORLD] for axes in candidates.axes])
-    cost = 0.5 * np.log(squared + NOISE_M**2).mean(axis=-1) + PARAMETER_COST * expected
-    return Errors(cost, squared)
+    return Errors(squared, PARAMETER_COST * expected)
 
 
 def _guess(candidates: Candidates, offset: FloatArray, demos: int) -> FloatArray:

@@ -161,8 +161,8 @@ def _clusters(varies: FloatArray, tolerance: float) -> list[tuple[int, ...]]:
 
 
 def _outnumbers(members: tuple[int, ...], clusters: Sequence[tuple[int, ...]]) -> bool:
-    """Whether more keypoints keep their shape than their distances."""
-    return all(len(members) > len(cluster) for cluster in clusters if not set(cluster).isdisjoint(members))
+    """Whether more keypoints keep their shape than their distances, those that keep their distances among them."""
+    return all(set(cluster) < set(members) for cluster in clusters if not set(cluster).isdisjoint(members))
 
 
 def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray) -> list[Thing]:

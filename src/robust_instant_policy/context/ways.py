@@ -20,10 +20,10 @@ from robust_instant_policy.context.choice import NOISE_M, Candidates, prediction
 from robust_instant_policy.context.things import WORLD, Located, Scene, Thing, find_things, locate
 from robust_instant_policy.geometry import FloatArray, fit_upright
 
-RANK_GAIN, SPLIT_GAIN = 1.0, 3.5  # sums of logarithms of the errors at key steps by which an explanation must be better
+RANK_GAIN, SPLIT_GAIN = 1.0, 1.0  # sums of logarithms of the errors at key steps by which an explanation must be better
 LEAST_OF_A_WAY = 2  # demonstrations
 ALIKE_M = 0.006  # largest difference of the shapes of things that are alike
-SINGLE_ERROR_M = 0.010  # where every key step is predicted better than this, all do the same
+SINGLE_ERROR_M = 0.018  # where every key step is predicted better than this, all do the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,21 +92,17 @@ def find_order(keypoints: FloatArray, hands: FloatArray) -> Order | None:
     for order in orders:
         named = order.renamed(keypoints) if order else keypoints
         things = find_things(named)
-        costs.append(_cost(things, locate([WORLD, *things], named), hands) + RANK_GAIN * (order is not None))
+        costs.append(_cost(_squared(things, locate([WORLD, *things], named), hands)) + RANK_GAIN * bool(order))
     return orders[int(np.argmin(costs))]
 
 
 def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tuple[Split, np.ndarray] | None:
-    """What parts demonstrations in ``scene`` with ``hands (I, T, A, 3, 3)`` at the key steps, and which side ``(I,)`` each
-    is on (True: the second); None where one way explains them as well."""
+    """What parts demonstrations in ``scene`` with ``hands (I, T, A, 3, 3)`` at the key steps, and which side ``(I,)``
+    each is on (True: the second); None where one way explains them as well."""
     demos = len(hands)
-    if demos < 2 * LEAST_OF_A_WAY:
+    single = _squared(things, scene, hands)
+    if demos < 2 * LEAST_OF_A_WAY or single.max() < SINGLE_ERROR_M**2:
         return None
-    simple = _candidates(things, scene)
-    worst = max(_errors(simple, hands[:, :, arm])[1].max() for arm in range(hands.shape[2]))
-    if worst < SINGLE_ERROR_M:
-        return None
-    single = _cost(things, scene, hands)
     splits: dict[bytes, list[tuple[float, Split, np.ndarray]]] = {}
     for measure in _measures(things):
         values = measure.value(scene)
@@ -122,34 +118,25 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
     best: tuple[float, Split, np.ndarray] | None = None
     for same in splits.values():
         margin, split, side = max(same, key=lambda one: one[0])
-        cost = 0.0
+        squared = np.zeros_like(single)
         for part in (~side, side):
-            own_scene = {thing: located.of(part) for thing, located in scene.items()}
-            cost += part.mean() * _cost(things, own_scene, hands[part])
-        cost += SPLIT_GAIN - min(margin, 1.0)
-        if best is None or cost < best[0]:
+            own = {thing: located.of(part) for thing, located in scene.items()}
+            squared += part.mean() * _squared(things, own, hands[part])
+        cost = _cost(squared) - min(margin, 1.0)
+        if squared.max() < single.max() / 4 and (best is None or cost < best[0]):
             best = cost, split, side
-    return (best[1], best[2]) if best is not None and best[0] < single else None
+    return (best[1], best[2]) if best is not None and best[0] + SPLIT_GAIN < _cost(single) else None
 
 
-def _candidates(things: Sequence[Thing], scene: Scene) -> Candidates:
-    return Candidates.of([thing for thing in things if thing.kind != "hinged"], scene)
+def _squared(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> FloatArray:
+    """Mean squared errors ``(A, T)``, square metres, with which demonstrations predict each other in the best frames."""
+    candidates = Candidates.of(things, scene)
+    arms = [prediction_errors(candidates, hands[:, :, arm]).mean_squared for arm in range(hands.shape[2])]
+    return np.stack([errors.min(axis=(1, 2)) for errors in arms])
 
 
-def _errors(candidates: Candidates, hands: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least cost of each step ``(T,)``, and the error, metres, of that candidate."""
-    errors = prediction_errors(candidates, hands)
-    cost = errors.cost.reshape(len(errors.cost), -1)
-    squared = errors.squared.reshape(*cost.shape, -1)
-    best = cost.argmin(axis=1)
-    steps = np.arange(len(cost))
-    return cost[steps, best], np.sqrt(squared[steps, best].mean(axis=-1))
-
-
-def _cost(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> float:
-    """Sum over the key steps and arms of the logarithm of the least error."""
-    candidates = _candidates(things, scene)
-    return float(sum(_errors(candidates, hands[:, :, arm])[0].sum() for arm in range(hands.shape[2])))
+def _cost(squared: FloatArray) -> float:
+    return 0.5 * float(np.log(squared + NOISE_M**2).sum())
 
 
 def _alike(things: Sequence[Thing], keypoints: FloatArray) -> tuple[tuple[int, ...], ...]:
