@@ -10,7 +10,8 @@ import numpy as np
 from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.context.codec import read_rows, row_grammar, row_pattern, write_row
+from robust_instant_policy.context.choice import NOISE_M
+from robust_instant_policy.context.codec import MM, read_rows, row_grammar, row_pattern, write_row
 from robust_instant_policy.context.frames import Frame
 from robust_instant_policy.context.prompt import INSTRUCTION, REACH_MM, Prompt
 from robust_instant_policy.context.step_frames import StepFrames
@@ -19,11 +20,10 @@ from robust_instant_policy.geometry import FloatArray, fit_rigid
 from robust_instant_policy.query import Query
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
-AGREE_MM = 1.0  # a number on which all demonstrations agree this closely is not asked for
 MIN_DEMOS_TO_AGREE = 3
 INPUTS_PER_QUERY = 2  # keypoint coordinates shown with each example
 NOISE_MM = 5.0  # variation of a keypoint coordinate that carries no information
-INTERPOLATED_MM = 2.0  # a step whose numbers follow from its neighbours this closely is not asked for
+INTERPOLATED_MM = 5.0  # a step whose numbers follow from its neighbours this closely is not asked for
 LEVER_MM = 100.0  # distance at which turns are written as lengths
 HAND_DIM, HAND_STATE = 7, 6  # numbers of a hand: point, turn, state
 STEPS_PER_QUERY = 4  # neighbouring steps asked for together: they share the examples' inputs
@@ -64,6 +64,10 @@ class FactorisedPrompt(Prompt):
 
     def way(self, keypoints: FloatArray) -> int:
         return 0 if self.split is None else self.split.decide(self.frames.named(self.checked(keypoints)))[0]
+
+    def notes(self) -> tuple[str, ...]:
+        split = () if self.split is None else (str(self.split),)
+        return (*split, *super().notes())
 
     def vote(self, keypoints: FloatArray) -> float:
         return 1.0 if self.split is None else self.split.decide(self.frames.named(self.checked(keypoints)))[1]
@@ -194,7 +198,7 @@ def _question(arm: int, steps: Sequence[int], offsets: FloatArray, shown: FloatA
     largest = np.abs(whole).max(axis=0)
     is_state = np.arange(offsets.shape[2]) % HAND_DIM == HAND_STATE
     if len(offsets) >= MIN_DEMOS_TO_AGREE:
-        varies = np.where(is_state, largest > 0, np.abs(offsets).max(axis=0) > AGREE_MM)
+        varies = np.where(is_state, largest > 0, np.sqrt((offsets**2).mean(axis=0)) > MM * NOISE_M)
     else:
         varies = np.broadcast_to(~is_state, largest.shape)
     own = range(HAND_DIM * arm, HAND_DIM * (arm + 1))

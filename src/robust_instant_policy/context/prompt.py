@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from robust_instant_policy.context.step_frames import StepFrames
+from robust_instant_policy.context.things import DEMOS_TO_TELL_THINGS, WORLD
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.query import Query
@@ -20,6 +21,15 @@ REACH_MM = 5000.0  # an answer with a larger number is refused: no arm reaches t
 INSTRUCTION = (
     "Each example maps numbers to numbers. Find the rule and complete the last example. "
     "Answer with the missing numbers only, in the same layout, without any other words."
+)
+
+CLOSE_VOTE = 0.5  # below which a scene lies between two ways
+CLOSE_NOTE = (
+    "the scene lies between those in which the demonstrations do different things; the better supported way is followed "
+    "(vote {:.2f}, 1 is as clear as the demonstrations)"
+)
+GUESS_NOTE = (
+    "the frames are a guess: one or two demonstrations do not tell what a motion depends on; show three or more"
 )
 
 Layout = Literal["sequence", "factorised"]
@@ -64,6 +74,27 @@ class Prompt(ABC):
         """How clearly one way applies in the scene of ``keypoints (K, 3)``: 1 as clearly as in the demonstrations, 0 not
         at all."""
         return 1.0
+
+    @property
+    def predicted_error(self) -> float:
+        """How far off, metres, demonstrations are at the worst step when each is predicted from the others."""
+        return max(frame.error for arm in self.frames.arms for frame in arm)
+
+    def outside(self, keypoints: FloatArray) -> float:
+        """How far the scene of ``keypoints (K, 3)`` lies outside of the demonstrations in what the frames depend on; 0
+        within them, 1 by as much as they vary (`StepFrames.outside`)."""
+        return self.frames.outside(self.keypoints, self.checked(keypoints))
+
+    def notes(self) -> tuple[str, ...]:
+        """For the user, one line each: what was inferred that may be wrong."""
+        guess = len(self.shown) < DEMOS_TO_TELL_THINGS and any(frame.things != (WORLD,) for frame in self.frames.used)
+        ranks = () if self.frames.order is None else (str(self.frames.order),)
+        return (*ranks, *((GUESS_NOTE,) if guess else ()))
+
+    def scene_notes(self, keypoints: FloatArray) -> tuple[str, ...]:
+        """The same about the scene of ``keypoints (K, 3)``."""
+        vote = self.vote(keypoints)
+        return () if vote >= CLOSE_VOTE else (CLOSE_NOTE.format(vote),)
 
     @abstractmethod
     def queries(self, keypoints: FloatArray) -> list[Query]:

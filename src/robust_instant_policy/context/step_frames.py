@@ -50,11 +50,31 @@ class StepFrames:
     def num_arms(self) -> int:
         return len(self.arms)
 
+    @property
+    def used(self) -> tuple[Frame, ...]:
+        """The frames of different words."""
+        return tuple({str(frame): frame for arm in self.arms for frame in arm}.values())
+
+    def outside(self, demonstrated: FloatArray, keypoints: FloatArray) -> float:
+        """How far ``keypoints (K, 3)`` lie outside of the ``demonstrated (I, K, 3)`` scenes in the frames' own variables.
+
+        These are the distances between the two ends of an origin and of a line, and the sizes of things: what a frame
+        extrapolates. The largest excess, as a share of the range that was shown.
+        """
+        pairs = {frame.ends for frame in self.used if len(frame.ends) == 2}
+        pairs |= {tuple(end.thing for end in frame.axes.ends) for frame in self.used if len(frame.axes.ends) == 2}
+        sizes = {thing for frame in self.used for thing, _ in frame.growth}
+        every = np.stack([self.named(points) for points in [*demonstrated, keypoints]])
+        scene = locate([thing for own in [*pairs, tuple(sizes)] for thing in own], every)
+        values = [np.linalg.norm(scene[a].position - scene[b].position, axis=1) for a, b in pairs]
+        values += [scene[thing].size for thing in sizes]
+        return max((_excess(own[:-1], own[-1]) for own in values), default=0.0)
+
     def poses(self, keypoints: FloatArray) -> FloatArray:
         """Pose of each step's frame ``(T, A, 4, 4)`` in the scene of ``keypoints (K, 3)``."""
         keypoints = self.named(keypoints)
         frames = [frame for of_step in zip(*self.arms, strict=True) for frame in of_step]
-        scene = locate({thing: None for frame in frames for thing in frame.things}, keypoints[None])
+        scene = locate([thing for frame in frames for thing in frame.things], keypoints[None])
         return np.stack([frame.pose_in(scene)[0] for frame in frames]).reshape(-1, self.num_arms, 4, 4)
 
     def named(self, keypoints: FloatArray) -> FloatArray:
@@ -90,6 +110,12 @@ class StepFrames:
         named = self.named(keypoints)
         shown = [MM * transform_points(invert_pose(pose), named).ravel() for pose in poses.reshape(-1, 4, 4)]
         return np.reshape(shown, (*poses.shape[:2], -1))
+
+
+def _excess(shown: FloatArray, value: float) -> float:
+    """By how much ``value`` lies outside of the range of the ``shown (I,)`` values, as a share of it."""
+    low, high = float(shown.min()), float(shown.max())
+    return max(low - value, value - high, 0.0) / max(high - low, 1e-3)
 
 
 def hands_of(actions: FloatArray) -> FloatArray:

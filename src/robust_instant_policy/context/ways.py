@@ -37,6 +37,10 @@ class Measure:
     def value(self, scene: Scene) -> FloatArray:
         return self.function(*(scene[thing] for thing in self.things))
 
+    def value_at(self, keypoints: FloatArray) -> float:
+        """In the scene of ``keypoints (K, 3)``."""
+        return float(self.value(locate(self.things, keypoints[None]))[0])
+
 
 @dataclass(frozen=True, eq=False)
 class Order:
@@ -76,8 +80,7 @@ class Split:
 
     def decide(self, keypoints: FloatArray) -> tuple[int, float]:
         """The way for ``keypoints (K, 3)``, 0 or 1, and the vote in [0, 1]: 1 is as clear as the demonstrations are."""
-        value = self.measure.value(locate(self.measure.things, keypoints[None]))
-        beyond = float(value[0]) - self.threshold
+        beyond = self.measure.value_at(keypoints) - self.threshold
         return int(beyond >= 0), float(min(1.0, abs(beyond) / (self.gap / 2)))
 
 

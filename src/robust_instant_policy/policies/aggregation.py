@@ -104,5 +104,12 @@ def make_plan(
         pixels=scene.located.pixels,
         keypoint_confidence=scene.located.confidence,
         usage=Usage((scene.stage, *proposal.stages, *stages)),
-        notes=(*context.notes, *scene.notes, *proposal.notes, *map(str, outside), *unknown),
+        notes=(
+            *context.notes,
+            *scene.notes,
+            *context.prompt.scene_notes(scene.keypoints),
+            *proposal.notes,
+            *map(str, outside),
+            *unknown,
+        ),
     )

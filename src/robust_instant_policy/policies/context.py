@@ -84,7 +84,7 @@ def build_context(
         extractor=extractor,
         pixels=extractor.pixels_,
         report=report,
-        notes=(*extractor.notes_, *report.notes),
+        notes=(*extractor.notes_, *report.notes, *given.notes),
     )
 
 
@@ -104,7 +104,7 @@ def context_of_keypoints(keypoints: FloatArray, trajectories: Sequence[Trajector
         prompt,
         SetReport((), Envelope.of(trajectories, HORIZONTAL), None),
         leave_one_out(keypoints, thinned, prompt),
-        (),
+        prompt.notes(),
     )
 
 
