@@ -149,10 +149,8 @@ def confused(things: Sequence[FloatArray], condition: str, rng: np.random.Genera
         things[-1] = np.column_stack([rng.uniform(*TABLE_M, (len(last), 2)), rng.uniform(0, 0.05, len(last))])
     elif condition == "added":  # every other keypoint is found on the thing that is not the right one
         things[-1][::2] += elsewhere - last.mean(axis=0)
-    elif condition == "exchanged":  # each found on the other, with the shape of its own
-        first = things[0]
-        things[0] = first - first.mean(axis=0) + last.mean(axis=0)
-        things[-1] = last - last.mean(axis=0) + first.mean(axis=0)
+    elif condition == "exchanged":  # the keypoints of each are found on the other
+        things[0], things[-1] = np.resize(last, things[0].shape), np.resize(things[0], last.shape)
     return things
 
 

@@ -22,10 +22,12 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pick_and_place import WITHIN_M
@@ -61,6 +63,7 @@ ASKING = ("kat", "rip-gauss", "rip")
 CHEAP = ("median", "neighbours", "gp", "gp-world")
 STAND_IN = "stand-in"  # a regression in place of a language model, see `stand_in.py`
 CONFIDENT = ("neighbours", "rip")  # methods whose plans have a confidence
+STANDARD = (2.0, 10)  # keypoint noise in mm, and demonstrations, of the main table
 GATE = 0.9  # confidence from which on a plan would be executed
 FIRST_NEW = 1000  # scenes from here on are new, demonstrations count from 0
 QUICK = {"families": ("place", "push-to", "perp", "nearest", "along"), "sets": 1, "scenes": 4}
@@ -258,7 +261,16 @@ def read_rows(path: Path) -> list[Row]:
 def keep(path: Path, row: Row) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
-        file.write(json.dumps(asdict(row)) + "\n")
+        file.write(json.dumps(rounded(asdict(row))) + "\n")
+
+
+def rounded(value: Any) -> Any:
+    """``value`` with all its numbers to a hundredth of a millimetre, for short lines."""
+    if isinstance(value, float):
+        return round(value, 5) if math.isfinite(value) else value
+    if isinstance(value, dict):
+        return {name: rounded(one) for name, one in value.items()}
+    return [rounded(one) for one in value] if isinstance(value, tuple | list) else value
 
 
 def cases(options: argparse.Namespace) -> list[Case]:
@@ -305,24 +317,40 @@ def run(options: argparse.Namespace) -> None:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Success and median error by family, method and model, for each noise and number of demonstrations."""
-    lines = []
-    for noise, demos in sorted({(row.case.noise_mm, row.case.demos) for row in rows}):
-        part = [row for row in rows if (row.case.noise_mm, row.case.demos) == (noise, demos)]
-        columns = sorted(
-            {(row.case.method, row.case.model) for row in part}, key=lambda one: (METHODS.index(one[0]), one[1])
-        )
-        lines += ["", f"{demos} demonstrations, keypoint noise {noise:g} mm:", ""]
-        lines.append("| family | " + " | ".join(f"{method} {model}".strip() for method, model in columns) + " |")
-        lines.append("| --- " * (len(columns) + 1) + "|")
-        for name in FAMILIES:
-            own = [row for row in part if row.case.family == name]
-            if own:
-                cells = [cell([row for row in own if (row.case.method, row.case.model) == one]) for one in columns]
-                lines.append(f"| {name} | " + " | ".join(cells) + " |")
-        cells = [cell([row for row in part if (row.case.method, row.case.model) == one]) for one in columns]
-        lines.append("| all | " + " | ".join(cells) + " |")
-    return "\n".join(lines).strip() + "\n"
+    """Success and errors by family, method and model at `STANDARD`; success alone for other noise and numbers."""
+    columns = sorted(
+        {(row.case.method, row.case.model) for row in rows}, key=lambda one: (METHODS.index(one[0]), one[1])
+    )
+    by_case: dict[tuple, list[Row]] = defaultdict(list)
+    for row in rows:
+        for family in (row.case.family, "all"):
+            by_case[family, row.case.method, row.case.model, row.case.noise_mm, row.case.demos].append(row)
+    families = [name for name in (*FAMILIES, "all") if any(row.case.family == name or name == "all" for row in rows)]
+
+    def lines(title: str, heads: Sequence[str], cells: Callable[[str], list[str]]) -> list[str]:
+        head = ["", title, "", "| family | " + " | ".join(heads) + " |", "| --- " * (len(heads) + 1) + "|"]
+        return head + [f"| {name} | " + " | ".join(cells(name)) + " |" for name in families]
+
+    noise, demos = STANDARD
+    text = lines(
+        f"{demos} demonstrations, {noise:g} mm of noise: right, median error at key steps and along the way (mm).",
+        [f"{method} {model}".strip() for method, model in columns],
+        lambda name: [cell(by_case[name, *column, *STANDARD]) for column in columns],
+    )
+    for column in columns:
+        others = sorted({key[3:] for key in by_case if key[1:3] == column})
+        if len(others) > 1:
+            text += lines(
+                f"`{' '.join(column).strip()}`: right, by demonstrations and keypoint noise.",
+                [f"{demos}, {noise:g} mm" for noise, demos in others],
+                lambda name, column=column, others=others: [share(by_case[name, *column, *one]) for one in others],
+            )
+    return "\n".join(text).strip() + "\n"
+
+
+def share(rows: Sequence[Row]) -> str:
+    errors = np.array([error for row in rows for error in row.outcome.errors])
+    return f"{(errors <= WITHIN_M).mean():.0%}" if rows else "–"
 
 
 def cell(rows: Sequence[Row]) -> str:
@@ -331,8 +359,7 @@ def cell(rows: Sequence[Row]) -> str:
         return "–"
     errors = np.array([error for row in rows for error in row.outcome.errors])
     ways = np.array([error for row in rows for error in row.outcome.ways])
-    right = (errors <= WITHIN_M).mean()
-    return f"{right:.0%} of {len(errors)}, {in_mm(np.median(errors))}, {in_mm(np.median(ways))}"
+    return f"{share(rows)} of {len(errors)}, {in_mm(np.median(errors))}, {in_mm(np.median(ways))}"
 
 
 def confidence_table(rows: Sequence[Row]) -> str:
@@ -428,7 +455,8 @@ def main() -> None:
     options.methods = options.methods or (CHEAP + (ASKING if options.llm else ()))
     if not options.table:
         run(options)
-    rows = [row for row in read_rows(options.rows) if row.case.split == options.split]
+    latest = {row.case: row for row in read_rows(options.rows) if row.case.split == options.split}
+    rows = list(latest.values())
     usual = [row for row in rows if row.case.condition == USUAL]
     examined = {row.case.family for row in rows if row.case.condition != USUAL}
     judged_rows = [row for row in rows if row.case.method in CONFIDENT and row.case.family in examined]

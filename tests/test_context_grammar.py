@@ -84,7 +84,7 @@ def test_between_two_ways_one_is_followed_whole_and_a_note_says_so():
 
 
 def test_each_way_shows_a_model_its_own_demonstrations():
-    keypoints, trajectories, draw = shown("side")
+    keypoints, trajectories, _ = shown("side")
     prompt = write_prompt(keypoints, trajectories)
     first, second = prompt.ways
     assert sorted(first.shown + second.shown) == list(range(10))
@@ -100,7 +100,7 @@ def test_one_demonstration_is_said_to_be_a_guess():
 
 
 def test_a_scene_that_stretches_what_was_shown_is_outside():
-    keypoints, trajectories, draw = shown("push-to")
+    keypoints, trajectories, _ = shown("push-to")
     prompt = write_prompt(keypoints, trajectories)
     far = keypoints[0].copy()
     far[5:, 0] += 0.6

@@ -1,13 +1,15 @@
 """Which frame each step is written in: the one that predicts a demonstration best from the others.
 
-A candidate is a choice of axes R and of the one or two things that the origin depends on. In a scene, the hand's centre is
+A candidate is a choice of axes R and of the one or two things on which the origin depends. In a scene, the hand's
+centre is
 
     y = o + X w,   X = [o' - o | B | B' | R | (s - 1) R …]
 
 with o, o' the things' positions, B, B' their axes, and s the sizes of things that have one: share of the way, points
 fixed in the things, offset in the axes and its growth are all linear. Ridge regression gives w, and its hat matrix H
-the residuals of each demonstration when it is left out, (I - H_ii)⁻¹ r_i, for all candidates and steps at once. The hand's
-turn is predicted by the mean of the others' in the axes.
+the residuals of each demonstration when it is left out, (I - H_ii)⁻¹ r_i, for all candidates and steps at once (the
+keypoints of the one that is left out are noisy, too). The hand's turn is predicted by the mean of the others' in the
+axes.
 """
 
 from __future__ import annotations
@@ -159,8 +161,11 @@ def prediction_errors(candidates: Candidates, hands: FloatArray) -> Errors:
 
 
 def _guess(candidates: Candidates, offset: FloatArray, demos: int) -> FloatArray:
-    """Expected squared error ``(T, M, N, I)`` where demonstrations are too few to tell: the keypoints' noise, carried to
-    the hand at ``offset (N, I, 3, T)``, and a share of its distance. A thing is seen in its own axes."""
+    """Expected squared error ``(T, M, N, I)`` where demonstrations are too few to tell.
+
+    The keypoints' noise, carried to the hand at ``offset (N, I, 3, T)``, and a share of its distance. A thing is seen
+    in its own axes.
+    """
     distance = np.linalg.norm(offset, axis=2)  # (N, I, T)
     noise = np.full(distance.shape, NOISE_M**2)
     suits = np.zeros((len(candidates.axes), len(candidates.origins)))

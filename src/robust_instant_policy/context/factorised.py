@@ -47,9 +47,11 @@ class Question:
 
 @dataclass(frozen=True, eq=False)
 class FactorisedPrompt(Prompt):
-    """``numbers (I, T, 7·A)`` of the aligned demonstrations, see `as_turns`; queries ask for
-    differences from their ``median (T, 7·A)``, which is in whole millimetres. Where demonstrations differ in what they do,
-    ``parts`` are the prompts of their ways, between which ``split`` decides."""
+    """``numbers (I, T, 7·A)`` of the aligned demonstrations, see `as_turns`; queries ask for differences from their
+    ``median (T, 7·A)``, which is in whole millimetres.
+
+    Where demonstrations do different things, ``parts`` are the prompts of their ways, between which ``split`` decides.
+    """
 
     numbers: FloatArray
     median: FloatArray
@@ -131,9 +133,9 @@ class FactorisedPrompt(Prompt):
 def as_turns(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Hands ``(I, T, 7·A)``, and the ``reference (T, A, 3, 3)`` from which they turn, of ``numbers (I, T, 10·A)``.
 
-    For each arm the point between the fingertips, millimetres; the rotation vector from the reference, in millimetres at
-    `LEVER_MM`; the gripper state. The reference are the points of the most
-    typical demonstration about that point, see `StepFrames`.
+    For each arm the point between the fingertips, millimetres; the rotation vector from the reference, in millimetres
+    at `LEVER_MM`; the gripper state. The reference are the gripper's points about that point in the most typical
+    demonstration.
     """
     rows = numbers.reshape(*numbers.shape[:2], -1, ACTION_DIM)
     points = rows[..., 3:STATE_INDEX].reshape(*rows.shape[:-1], 2, 3)

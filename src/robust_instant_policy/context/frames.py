@@ -1,8 +1,8 @@
 """Frames as a grammar: an origin, and axes.
 
 "4 cm above the cup" is the same numbers in every demonstration in the cup's frame; "10 cm to the left of the middle
-between cup and saucer" is so in a frame whose origin is at a share of the way from one to the other, with axes along the
-line between them. The words are
+between cup and saucer" is so in a frame whose origin is at a share of the way from one to the other, with axes along
+the line between them. The words are
 
     frame  = origin, axes [, growth]
     origin = point of a thing  |  share of the way between points of two things

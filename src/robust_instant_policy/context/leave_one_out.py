@@ -24,10 +24,10 @@ def leave_one_out(
     """Error ``(I, S)``, metres, with which each demonstration is predicted from the others, at S key steps.
 
     Predicted are the gripper point and the fingertips of each arm in the frames of the steps, from the demonstrations
-    that go the same way, by ridge regression on the keypoint coordinates that a language model would be shown; the error
-    is that of the worst point. Frames and ways are those of ``prompt``, by default of the adaptive one. Key steps are the
-    first and the last one and both sides of every gripper change. ``keypoints (I, K, 3)`` in metres. NaN with fewer than
-    `MIN_DEMOS` demonstrations that use the gripper alike.
+    that go the same way, by ridge regression on the keypoint coordinates that a language model would be shown; the
+    error is that of the worst point. Frames and ways are those of ``prompt``, by default of the adaptive one. Key steps
+    are the first and the last one and both sides of every gripper change. ``keypoints (I, K, 3)`` in metres. NaN with
+    fewer than `MIN_DEMOS` demonstrations that use the gripper alike.
     """
     aligned = align(trajectories)
     errors = np.zeros((len(aligned.kept), len(aligned.key_steps)))

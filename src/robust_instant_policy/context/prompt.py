@@ -25,8 +25,8 @@ INSTRUCTION = (
 
 CLOSE_VOTE = 0.5  # below which a scene lies between two ways
 CLOSE_NOTE = (
-    "the scene lies between those in which the demonstrations do different things; the better supported way is followed "
-    "(vote {:.2f}, 1 is as clear as the demonstrations)"
+    "the scene lies between those in which the demonstrations do different things; the better supported way is "
+    "followed (vote {:.2f}, 1 is as clear as the demonstrations)"
 )
 GUESS_NOTE = (
     "the frames are a guess: one or two demonstrations do not tell what a motion depends on; show three or more"
@@ -41,8 +41,8 @@ Order = Literal["given", "nearest-last"]
 class Prompt(ABC):
     """Serialised demonstrations; made by `write_prompt`.
 
-    ``keypoints (I, K, 3)``, metres, are those of the demonstrations ``shown`` (indices), ``frames`` the frame of each step.
-    Evenly spread over a trajectory, ``curvature (B,)``, metres, bound how sharply the gripper is expected to
+    ``keypoints (I, K, 3)``, metres, are those of the demonstrations ``shown`` (indices), ``frames`` the frame of each
+    step. Evenly spread over a trajectory, ``curvature (B,)``, metres, bound how sharply the gripper is expected to
     turn (see `AlignedDemonstrations.curvature`), and ``variation (T,)``, metres, is the demonstrations'
     standard deviation in these frames; None in the world frame, where scenes vary too, and of one demonstration.
 
@@ -71,8 +71,7 @@ class Prompt(ABC):
         return self.ways[self.way(keypoints)]
 
     def vote(self, keypoints: FloatArray) -> float:
-        """How clearly one way applies in the scene of ``keypoints (K, 3)``: 1 as clearly as in the demonstrations, 0 not
-        at all."""
+        """How clearly one way applies in the scene of ``keypoints (K, 3)``: 1 is as in the demonstrations, 0 a tie."""
         return 1.0
 
     @property

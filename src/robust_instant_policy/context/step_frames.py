@@ -56,13 +56,14 @@ class StepFrames:
         return tuple({str(frame): frame for arm in self.arms for frame in arm}.values())
 
     def outside(self, demonstrated: FloatArray, keypoints: FloatArray) -> float:
-        """How far ``keypoints (K, 3)`` lie outside of the ``demonstrated (I, K, 3)`` scenes in the frames' own variables.
+        """How far ``keypoints (K, 3)`` lie outside of the ``demonstrated (I, K, 3)`` scenes in what frames extrapolate.
 
-        These are the distances between the two ends of an origin and of a line, and the sizes of things: what a frame
-        extrapolates. The largest excess, as a share of the range that was shown.
+        These are the distances between the two ends of an origin and of a line, and the sizes of things. The largest
+        excess, as a share of the range that was shown.
         """
-        pairs = {frame.ends for frame in self.used if len(frame.ends) == 2}
-        pairs |= {tuple(end.thing for end in frame.axes.ends) for frame in self.used if len(frame.axes.ends) == 2}
+        ends = {frame.ends for frame in self.used}
+        ends |= {tuple(end.thing for end in frame.axes.ends) for frame in self.used}
+        pairs = [own for own in ends if len(own) == 2]
         sizes = {thing for frame in self.used for thing, _ in frame.growth}
         every = np.stack([self.named(points) for points in [*demonstrated, keypoints]])
         scene = locate([thing for own in [*pairs, tuple(sizes)] for thing in own], every)

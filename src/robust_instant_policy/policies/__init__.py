@@ -30,11 +30,12 @@ from robust_instant_policy.policies.neighbours import Neighbours
 from robust_instant_policy.policies.policy import ClosedLoopPolicy, Plan, Policy, Progress, Stage, Usage
 from robust_instant_policy.policies.rip import RobustInstantPolicy
 from robust_instant_policy.policies.sampling import Proposal, Samples, propose, sample
-from robust_instant_policy.policies.settings import Settings
+from robust_instant_policy.policies.settings import CONFIGS, Settings
 from robust_instant_policy.policies.training import Training
 
 __all__ = [
     "ASKING_METHODS",
+    "CONFIGS",
     "IMAGE_METHODS",
     "METHOD_NAMES",
     "REGRESSING_METHODS",

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robust_instant_policy.context import Prompt, leave_one_out, write_prompt
+from robust_instant_policy.context.alignment import align
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
@@ -15,7 +16,7 @@ from robust_instant_policy.perception import KeypointExtractor, Located
 from robust_instant_policy.policies.confidence import recognition
 from robust_instant_policy.policies.policy import Progress, Stage, Stopwatch, no_progress
 from robust_instant_policy.policies.settings import Settings
-from robust_instant_policy.sanity import Envelope, Finding, SetReport, check_demonstrations
+from robust_instant_policy.sanity import Envelope, Finding, SetReport, Surroundings, View, check_demonstrations
 from robust_instant_policy.trajectory import Trajectory, downsample
 
 HORIZONTAL = np.array([0.0, 0.0, 1.0, 0.0])  # plane through the world's origin
@@ -27,9 +28,9 @@ class Context:
     """What every method over keypoints starts from, made from ``demonstrations``.
 
     ``keypoints (I, K, 3)``, metres, world, and ``pixels (I, K, 2)`` (u, v) of the I demonstrations (no pixels, and no
-    ``extractor``, where the keypoints were given); their downsampled
-    ``trajectories``; the ``prompt`` that serialises both; the ``report`` of what was checked; ``prediction_errors
-    (I, S)`` in metres, see `leave_one_out`; ``notes`` for the user, one line each.
+    ``extractor``, where the keypoints were given); their downsampled ``trajectories``; the ``prompt`` that serialises
+    both; the ``report`` of what was checked; the ``surroundings`` of the gripper; ``prediction_errors (I, S)`` in
+    metres, see `leave_one_out`; ``notes`` for the user, one line each.
     """
 
     demonstrations: tuple[Demonstration, ...]
@@ -39,17 +40,22 @@ class Context:
     trajectories: tuple[Trajectory, ...]
     prompt: Prompt
     report: SetReport
+    surroundings: Surroundings
     prediction_errors: FloatArray
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class LocatedScene:
-    """What was recognised in one observation, what its checks found, and what both cost."""
+    """What was recognised in one observation, what its checks found, and what both cost.
+
+    ``view`` is the observation as the checks see it; None where only keypoints are known.
+    """
 
     located: Located
     stage: Stage
     findings: tuple[Finding, ...] = ()
+    view: View | None = None
 
     @property
     def keypoints(self) -> FloatArray:
@@ -75,15 +81,23 @@ def build_context(
     report.raise_if_wrong()
     progress("keypoints", 0, 0)
     extractor = KeypointExtractor(
-        settings.num_keypoints, settings.features, workspace=settings.workspace, seed=settings.seed
+        settings.num_keypoints,
+        settings.features,
+        settings.workspace,
+        settings.seed,
+        settings.descriptors,
+        settings.keypoints,
     ).fit([demonstration.observation for demonstration in demonstrations])
     given = context_of_keypoints(extractor.keypoints_, [one.trajectory for one in demonstrations], settings)
+    aligned = align(given.trajectories)
+    views = [View.of(demonstrations[index].observation) for index in aligned.kept]
     return replace(
         given,
         demonstrations=tuple(demonstrations),
         extractor=extractor,
         pixels=extractor.pixels_,
         report=report,
+        surroundings=Surroundings.of(views, aligned.actions),
         notes=(*extractor.notes_, *report.notes, *given.notes),
     )
 
@@ -103,6 +117,7 @@ def context_of_keypoints(keypoints: FloatArray, trajectories: Sequence[Trajector
         thinned,
         prompt,
         SetReport((), Envelope.of(trajectories, HORIZONTAL), None),
+        Surroundings.of((), align(thinned).actions),
         leave_one_out(keypoints, thinned, prompt),
         prompt.notes(),
     )
@@ -126,4 +141,4 @@ def locate(context: Context, observation: Observation, progress: Progress = no_p
     with watch.stage("keypoints"):
         findings = context.report.require_observation(observation)
         located = context.extractor.locate(observation)
-    return LocatedScene(located, watch.stages[0], findings)
+    return LocatedScene(located, watch.stages[0], findings, View.of(observation))

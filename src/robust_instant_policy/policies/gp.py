@@ -125,8 +125,8 @@ class KeypointRegression(KeypointPolicy):
 def _fitted(
     frames: StepFrames, keypoints: FloatArray, actions: FloatArray
 ) -> tuple[StepFrames, FloatArray, GaussianProcess]:
-    """``frames``, the median in them of ``actions (I, T, 10·A)`` in scenes with ``keypoints (I, K, 3)``, and the process
-    of the differences from it."""
+    """``frames``, the median in them of ``actions (I, T, 10·A)`` in scenes with ``keypoints (I, K, 3)``, and the
+    process of the differences from it."""
     numbers = np.stack([frames.encode(points, own) for points, own in zip(keypoints, actions, strict=True)])
     median = np.median(numbers, axis=0)
     residuals = (numbers - median) / MM
