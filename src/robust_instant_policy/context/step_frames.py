@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -54,6 +55,18 @@ class StepFrames:
     def used(self) -> tuple[Frame, ...]:
         """The frames of different words."""
         return tuple({str(frame): frame for arm in self.arms for frame in arm}.values())
+
+    def uses(self, keypoints: FloatArray) -> list[tuple[str, int, int, int, FloatArray]]:
+        """Runs of frames that continue each other in the scene of ``keypoints (K, 3)``: in words, the arm, the first
+        and the last step, and the last one's pose ``(4, 4)``."""
+        poses, found = self.poses(keypoints), []
+        for arm, own in enumerate(self.arms):
+            changes = [step for step in range(1, len(own)) if not own[step].continues(own[step - 1])]
+            for start, stop in pairwise([0, *changes, len(own)]):
+                first, last = own[start], own[stop - 1]
+                words = str(last) if first.share == last.share else f"{first.share:.0%} to {last}"
+                found.append((words, arm, start, stop - 1, poses[stop - 1, arm]))
+        return found
 
     def outside(self, demonstrated: FloatArray, keypoints: FloatArray) -> float:
         """How far ``keypoints (K, 3)`` lie outside of the ``demonstrated (I, K, 3)`` scenes in what frames extrapolate.

@@ -132,7 +132,7 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
 
 
 def _squared(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> FloatArray:
-    """Mean squared errors ``(A, T)``, square metres, of predicting one demonstration from the others in the best frames."""
+    """Mean squared error ``(A, T)``, square metres, of a demonstration predicted from the others in the best frames."""
     candidates = Candidates.of(things, scene)
     arms = [prediction_errors(candidates, hands[:, :, arm]).mean_squared for arm in range(hands.shape[2])]
     return np.stack([errors.min(axis=(1, 2)) for errors in arms])

@@ -18,7 +18,7 @@ from robust_instant_policy.policies.confidence import (
     prediction,
 )
 from robust_instant_policy.policies.context import Context, LocatedScene
-from robust_instant_policy.policies.policy import Plan, Stage, Stopwatch, Usage
+from robust_instant_policy.policies.policy import FrameUse, Plan, Stage, Stopwatch, Usage
 from robust_instant_policy.policies.sampling import Proposal
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.regression import RobustTrajectory, robust_gripper_trajectory
@@ -119,6 +119,7 @@ def make_plan(
         pixels=scene.located.pixels,
         keypoint_confidence=scene.located.confidence,
         usage=Usage((scene.stage, *proposal.stages, *stages)),
+        frames=tuple(FrameUse(*use) for use in context.prompt.for_scene(scene.keypoints).frames.uses(scene.keypoints)),
         notes=(
             *context.notes,
             *scene.notes,
