@@ -75,7 +75,7 @@ class KeypointExtractor:
         self.network_, note = choose_network(self.features, settings)
         self.descriptor_name_ = self.network_.name
         views = [make_view(observation, self.network_, self.workspace, self.seed) for observation in observations]
-        notes = [note, *dict.fromkeys(view.note for view in views if view.note)]
+        notes = [note, *dict.fromkeys(line for view in views for line in view.notes)]
         if len(views) == 1:
             notes.append(
                 "one demonstration only: nothing to compare it with, so the keypoints are its most salient points"
@@ -125,13 +125,13 @@ class KeypointExtractor:
         confidence = np.repeat([(found.fitness + found.similarity) / 2 for found in registrations], counts)
         confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / RESIDUAL_M**2)
         confidence[~measured] /= 2
-        notes = [view.note] if view.note else []
+        notes = list(view.notes)
         for k in np.flatnonzero(~measured):
             notes.append(f"keypoint {k} has no depth at its pixel; it is where its object says")
         for number, found in enumerate(registrations):
             if found.fitness < MIN_FITNESS:
                 notes.append(f"object {number} was hardly recognised (fit {found.fitness:.2f})")
-        return Located(points, pixels, np.clip(confidence, 0, 1), tuple(notes))
+        return Located(transform_points(view.to_world, points), pixels, np.clip(confidence, 0, 1), tuple(notes))
 
 
 def _expected_places(view: View, thing: RigidObject, places: FloatArray, found: Registration) -> FloatArray:

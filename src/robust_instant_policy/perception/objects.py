@@ -65,7 +65,7 @@ def find_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
     first = views[0]
     return [
         _model(views, first.xyzrgb[subsample(segment, MAX_TEMPLATE_POINTS, seed)], seed)
-        for segment in first.segments
+        for segment in first.pieces
         if len(segment) >= MIN_FOREGROUND_POINTS
     ]
 
