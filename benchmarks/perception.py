@@ -38,7 +38,7 @@ from robust_instant_policy.perception import PAPER_REAL, PAPER_SIMULATION, Keypo
 from robust_instant_policy.perception.accuracy import Accuracy
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.efficientnet import load_network
-from robust_instant_policy.perception.objects import register
+from robust_instant_policy.perception.objects import register_all
 from robust_instant_policy.perception.settings import DescriptorSettings
 from robust_instant_policy.perception.view import make_view
 from robust_instant_policy.perception.vit import VitDescriptors
@@ -187,7 +187,7 @@ def measure_speed(features: str, settings: DescriptorSettings, shape: tuple[int,
         "locate": lambda: extractor.locate(images[-1]),
         "describe": lambda: extractor.network_.describe(images[-1].rgb),
         "segment": lambda: make_view(images[-1], extractor.network_),
-        "register": lambda: [register(thing.templates, view) for thing in extractor.objects_],
+        "register": lambda: register_all([thing.templates for thing in extractor.objects_], view),
     }
     if features == "efficientnet":
         work["fit"] = lambda: extractor.fit(images[:DEMONSTRATIONS])

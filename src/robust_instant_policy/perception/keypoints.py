@@ -14,14 +14,17 @@ from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.network import choose_network
-from robust_instant_policy.perception.objects import Registration, RigidObject, find_objects, register
+from robust_instant_policy.perception.objects import Registration, RigidObject, find_objects, register_all
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
+from robust_instant_policy.perception.relevance import MIN_RELEVANCE, relevances, shares, still
 from robust_instant_policy.perception.selection import select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
 from robust_instant_policy.perception.view import View, make_view
+from robust_instant_policy.trajectory import Trajectory
 
 MIN_FITNESS = 0.15  # of an object's registration in every demonstration
 SAME_SHAPE_FITNESS = 0.7  # from which keypoints need no registration of their own
+SCENERY_WEIGHT = 0.2  # of what never moves, beside what does
 NEIGHBOURHOOD_M = 0.04  # around a keypoint, for a registration of its own
 
 
@@ -64,10 +67,14 @@ class KeypointExtractor:
         self.seed = seed
         self.settings = settings
 
-    def fit(self, observations: Sequence[Observation]) -> KeypointExtractor:
+    def fit(
+        self, observations: Sequence[Observation], trajectories: Sequence[Trajectory] | None = None
+    ) -> KeypointExtractor:
         """Choose keypoints and find them in ``observations``, the demonstrations' first images.
 
-        Raises `KeypointError` where the images have too little in common, or depth or foreground are missing.
+        With the demonstrations' ``trajectories`` the keypoints lie on what the hand approaches, grasps or moves relative
+        to, otherwise on all objects. Raises `KeypointError` where the images have too little in common, or depth or
+        foreground are missing.
         """
         if not observations:
             raise KeypointError("no demonstrations were given; record at least one")
@@ -83,23 +90,23 @@ class KeypointExtractor:
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
         objects = find_objects(views, self.seed)
-        self.objects_ = [thing for thing in objects if thing.worst_fitness >= MIN_FITNESS]
-        if not self.objects_:
+        common = [thing for thing in objects if thing.worst_fitness >= MIN_FITNESS]
+        if not common:
             best = max((thing.worst_fitness for thing in objects), default=0.0)
             raise KeypointError(
                 f"the images have nothing in common: the best object of the first has a fitness of {best:.2f} in the "
                 f"worst other image (needed: {MIN_FITNESS:.2f}); do all demonstrations show the same object?"
             )
-        if len(self.objects_) > self.num_keypoints:
+        weights = _weights(common, views, trajectories)
+        counts = shares(weights, self.num_keypoints)
+        self.objects_ = [thing for thing, count in zip(common, counts, strict=True) if count]
+        if (left := int((weights > 0).sum()) - len(self.objects_)) > 0:
             notes.append(
-                f"{len(self.objects_)} objects were found for {self.num_keypoints} keypoints; the largest have one each"
+                f"{len(common)} objects were found for {self.num_keypoints} keypoints; {left} of them have none"
             )
-            self.objects_.sort(key=lambda thing: len(thing.templates[0].xyzrgb), reverse=True)
-            del self.objects_[self.num_keypoints :]
-        share, more = divmod(self.num_keypoints, len(self.objects_))
         self._places = []  # of each object's keypoints, in the first image
-        for number, thing in enumerate(self.objects_):
-            points, replaced = select_points(thing, views, share + (number < more), self.seed)
+        for thing, count in zip(self.objects_, filter(None, counts), strict=True):
+            points, replaced = select_points(thing, views, count, self.seed)
             self._places.append(points)
             notes += replaced
         found = [self._locate(view, [t.registrations[i] for t in self.objects_]) for i, view in enumerate(views)]
@@ -114,7 +121,7 @@ class KeypointExtractor:
         Raises `KeypointError` where depth or foreground are missing.
         """
         view = make_view(observation, self.network_, self.workspace, self.seed)
-        return self._locate(view, [register(thing.templates, view) for thing in self.objects_])
+        return self._locate(view, register_all([thing.templates for thing in self.objects_], view))
 
     def _locate(self, view: View, registrations: Sequence[Registration]) -> Located:
         """The keypoints of objects with known ``registrations`` in ``view``."""
@@ -132,6 +139,28 @@ class KeypointExtractor:
             if found.fitness < MIN_FITNESS:
                 notes.append(f"object {number} was hardly recognised (fit {found.fitness:.2f})")
         return Located(transform_points(view.to_world, points), pixels, np.clip(confidence, 0, 1), tuple(notes))
+
+
+def _weights(
+    things: Sequence[RigidObject], views: Sequence[View], trajectories: Sequence[Trajectory] | None
+) -> FloatArray:
+    """Of objects ``(O,)``, for their numbers of keypoints."""
+    places = [
+        [
+            transform_points(view.to_world @ found.pose, thing.templates[0].xyzrgb[:, :3])
+            for view, found in zip(views, thing.registrations, strict=True)
+        ]
+        for thing in things
+    ]
+    if trajectories is not None:
+        relevant = relevances(places, trajectories)
+        relevant[relevant < MIN_RELEVANCE * relevant.max()] = 0
+        if relevant.any():
+            return relevant
+    sizes = np.array([len(points[0]) for points in places], dtype=np.float64)
+    weights = 1 + sizes / (1e3 * sizes.max())  # equal, but with too few keypoints the largest come first
+    scenery = np.array([still(points) for points in places])
+    return weights if scenery.all() else np.where(scenery, weights * SCENERY_WEIGHT, weights)
 
 
 def _expected_places(view: View, thing: RigidObject, places: FloatArray, found: Registration) -> FloatArray:

@@ -1,19 +1,23 @@
-"""Registration of XYZRGB points by a rotation about the vertical and a translation.
+"""Registration of XYZRGB points by a rotation about the vertical and a translation, in three steps.
 
-Descriptor matches vote for motions (Hough 1962); ICP in space and colour (Besl and McKay 1992) refines the best.
+1. `vote_for_motions`: matches of descriptors vote for motions (Hough 1962), and those with the most votes go on.
+2. `refine`: ICP in space and colour (Besl and McKay 1992) refines each, coarsely, then the best ones with all points.
+3. `rivals`: which other motions explain the image nearly as well.
+
 Objects stand on a table, so rotations are about the world's z axis only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robust_instant_policy.geometry import FloatArray, fit_upright, rotations_about_vertical, transform_points
-from robust_instant_policy.perception.descriptors import Float32Array, IntArray
+from robust_instant_policy.perception.descriptors import Float32Array
 
+# Votes.
 ANGLE_BINS = 24
 SHIFT_BIN_M = 0.015
 MAX_PEAKS = 4
@@ -21,19 +25,26 @@ SUPPRESSED_BINS = 3  # around a peak, on each side
 MATCHES_PER_POINT = 3
 MAX_MATCHES = 400  # the most similar; more do not change the peaks
 VOTE_EXPONENT = 4  # of the similarity, for a match's vote
+# ICP.
 COLOUR_CAP_M = 0.010  # greatest colour distance: objects of one kind have many colours
 RESIDUAL_M = 0.010  # at which a point counts 1/e in the fitness
 OWN_REACH_M = 0.04  # image points further from the object belong to others
 RESTART_ANGLES = np.deg2rad([0.0, -25.0, 25.0])
-SYMMETRY_ANGLES = np.deg2rad(np.arange(-20.0, 25.0, 5.0))  # the middle one is none
-MAX_SYMMETRY_LOSS = 0.04  # of the fitness, by these rotations, for a rotationally symmetric object
-SIMILARITY_SCALE = 0.01  # of the softmax over these rotations
 COARSE_POINTS = 60
 FINALISTS = 3
-COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)  # kernel width in each ICP iteration
+COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)  # kernel width in each iteration
 FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
 LOCAL_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
 MIN_WEIGHT = np.float32(1e-9)  # keeps the weights' sum above zero
+# Symmetry and rivals.
+SMALL_TURNS = np.deg2rad(np.arange(-20.0, 25.0, 5.0))  # the middle one is none
+MAX_SYMMETRY_LOSS = 0.04  # of the fitness, by small turns, for a rotationally symmetric object
+SIMILARITY_SCALE = 0.01  # of the softmax over small turns
+LARGE_TURNS = np.deg2rad(np.arange(30.0, 360.0, 30.0))
+SLIDES_M = 0.025 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+RIVAL_REACH_M = (0.02, 0.015)
+
+Similarity = Callable[[FloatArray], FloatArray]
 
 
 def vote_for_motions(source: FloatArray, target: FloatArray, similarities: Float32Array) -> FloatArray:
@@ -69,31 +80,65 @@ def vote_for_motions(source: FloatArray, target: FloatArray, similarities: Float
     return np.array(motions)
 
 
-def refine(
-    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Callable[[FloatArray], FloatArray]
-) -> tuple[FloatArray, float, float]:
-    """The best motion ``(4, 4)`` after ICP from ``motions (P, 4, 4)``; its fitness and similarity, both in [0, 1].
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """``motions (C, 4, 4)``, the best first, with the ``fitness (C,)`` of their points and the ``similarity (C,)`` of
+    their descriptors, both in [0, 1].
+    """
+
+    motions: FloatArray
+    fitness: FloatArray
+    similarity: FloatArray
+
+    @property
+    def score(self) -> FloatArray:
+        """``(C,)`` in [0, 1]."""
+        return (self.fitness + self.similarity) / 2
+
+
+def refine(motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> Candidates:
+    """The best candidates after ICP from ``motions (P, 4, 4)``.
 
     ``source (N, 6)`` and ``target (M, 6)`` are XYZRGB points; ``similarity`` is that of the descriptors under each of
-    several motions. A subset of the points selects `FINALISTS`, all points the best.
+    several motions. A subset of the points selects `FINALISTS`, all points order them.
     """
     centre = source[:, :3].mean(axis=0)
     starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
-    coarse = source[:: max(1, len(source) // COARSE_POINTS)], target[:: max(1, len(target) // (3 * COARSE_POINTS))]
-    starts, fitness = icp(starts, *coarse, COARSE_REACH_M)
+    starts, fitness = icp(starts, *_coarse(source, target), COARSE_REACH_M)
     leading = np.argsort(-fitness - similarity(starts))[:FINALISTS]
     finalists, fitness = icp(starts[leading], source, target, FINE_REACH_M)
     similarities = similarity(finalists)
-    best = int((fitness + similarities).argmax())
-    motion = finalists[best]
-    alternatives = rotated(motion, centre, SYMMETRY_ANGLES)
-    rotated_fitness = icp(alternatives, *coarse, ())[1]
-    if rotated_fitness.min() > rotated_fitness[len(alternatives) // 2] - MAX_SYMMETRY_LOSS:
-        # Points do not determine the rotation of a disc: take the descriptors' mean rotation.
-        likelihood = similarity(alternatives)
-        share = np.exp((likelihood - likelihood.max()) / SIMILARITY_SCALE)
-        motion = rotated(motion, centre, np.atleast_1d(share @ SYMMETRY_ANGLES / share.sum()))[0]
-    return motion, float(fitness[best]), float(similarities[best])
+    order = np.argsort(-fitness - similarities, kind="stable")
+    return Candidates(finalists[order], fitness[order], similarities[order])
+
+
+def settle_turn(motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> FloatArray:
+    """``motion (4, 4)``, turned to the descriptors' mean rotation if points do not determine it, as for a disc."""
+    centre = source[:, :3].mean(axis=0)
+    alternatives = rotated(motion, centre, SMALL_TURNS)
+    fitness = icp(alternatives, *_coarse(source, target), ())[1]
+    if fitness.min() <= fitness[len(alternatives) // 2] - MAX_SYMMETRY_LOSS:
+        return motion
+    likelihood = similarity(alternatives)
+    share = np.exp((likelihood - likelihood.max()) / SIMILARITY_SCALE)
+    return rotated(motion, centre, np.atleast_1d(share @ SMALL_TURNS / share.sum()))[0]
+
+
+def find_rivals(motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> Candidates:
+    """``motion (4, 4)`` itself, and that turned by `LARGE_TURNS` or slid by `SLIDES_M`, measured with a subset."""
+    centre = source[:, :3].mean(axis=0)
+    turned = rotated(motion, centre, LARGE_TURNS)
+    slid = np.repeat(motion[None], len(SLIDES_M), axis=0)
+    slid[:, :3, 3] += SLIDES_M
+    coarse = _coarse(source, target)
+    turned = icp(turned, *coarse, RIVAL_REACH_M)[0]
+    motions = np.concatenate([motion[None], turned, slid])
+    return Candidates(motions, icp(motions, *coarse, ())[1], similarity(motions))
+
+
+def _coarse(source: Float32Array, target: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """A subset of both."""
+    return source[:: max(1, len(source) // COARSE_POINTS)], target[:: max(1, len(target) // (3 * COARSE_POINTS))]
 
 
 def rotated(motion: FloatArray, centre: FloatArray, angles: FloatArray) -> FloatArray:

@@ -37,7 +37,8 @@ TRIM_ROUNDS = 4
 TRIM_DEVIATIONS = 3.0
 COLOUR_NOISE = 0.02  # standard deviation of the camera's noise in a colour channel, of a range of 1
 GAP_M = 0.015  # foreground points further apart in space belong to different pieces,
-GAP_PX = 3  # but pixels this near do not
+GAP_PX = 3  # but those of pixels this near do not,
+HIDDEN_GAP_M = 0.020  # nor those of such pixels this near in a horizontal direction: sides may be hidden from above
 MIN_PIECE_POINTS = 15
 MIN_TOLD_POINTS = 8  # smaller pieces are noise
 MAX_TOLD = 3
@@ -132,6 +133,7 @@ def make_view(
     footprint = GAP_PX * stride * float(np.nanmedian(depth)) / observation.intrinsics[0, 0]
     foreground = np.flatnonzero(label == 0)
     label[foreground] = _pieces(points[foreground], max(GAP_M, footprint))
+    _join_hidden(label, points, usable)
     small = _leave_out(label, heights, pixels)
 
     kept = np.flatnonzero(label >= 0)
@@ -192,7 +194,7 @@ def _unlike_table(
 
 
 def _pieces(points: FloatArray, gap: float) -> IntArray:
-    """Number ``(N,)`` of the piece of each of ``points (N, 3)``: chains of points less than ``gap`` apart, metres."""
+    """Number ``(N,)`` of the piece of each of ``points (N, 3)``: chains of points less than ``gap`` apart."""
     if not len(points):
         return np.zeros(0, dtype=np.intp)
     _, voxel, counts = np.unique(np.floor(points / (gap / 3)).astype(int), axis=0, return_inverse=True, return_counts=True)
@@ -201,6 +203,33 @@ def _pieces(points: FloatArray, gap: float) -> IntArray:
     a, b = cKDTree(centres).query_pairs(gap, output_type="ndarray").T
     graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(len(centres), len(centres)))
     return connected_components(graph, directed=False)[1][voxel].astype(np.intp)
+
+
+def _join_hidden(label: IntArray, points: FloatArray, usable: NDArray[np.bool_]) -> None:
+    """Join the pieces in ``label (N,)`` whose pixels meet and that are near in a horizontal direction.
+
+    ``points (N, 3)`` are those of the ``usable (h, w)`` pixels.
+    """
+    grid = np.full(usable.shape, -1)
+    grid[usable] = np.arange(len(points))
+    joined: list[IntArray] = []
+    for step in range(1, GAP_PX + 1):
+        for a, b in (
+            (grid[:, step:], grid[:, :-step]),
+            (grid[step:], grid[:-step]),
+            (grid[step:, step:], grid[:-step, :-step]),
+            (grid[step:, :-step], grid[:-step, step:]),
+        ):
+            known = (a >= 0) & (b >= 0)
+            one, other = a[known], b[known]
+            apart = (label[one] != label[other]) & (label[one] >= 0) & (label[other] >= 0)
+            one, other = one[apart], other[apart]
+            near = np.linalg.norm((points[one] - points[other])[:, :2], axis=1) < HIDDEN_GAP_M
+            joined.append(np.stack([label[one[near]], label[other[near]]], axis=1))
+    a, b = np.concatenate(joined).T
+    count = label.max() + 1
+    graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
+    label[label >= 0] = connected_components(graph, directed=False)[1][label[label >= 0]]
 
 
 def _leave_out(label: IntArray, heights: FloatArray, pixels: IntArray) -> str:

@@ -71,7 +71,10 @@ def build_context(
     progress("keypoints", 0, 0)
     extractor = KeypointExtractor(
         settings.num_keypoints, settings.features, workspace=settings.workspace, seed=settings.seed
-    ).fit([demonstration.observation for demonstration in demonstrations])
+    ).fit(
+        [demonstration.observation for demonstration in demonstrations],
+        [demonstration.trajectory for demonstration in demonstrations],
+    )
     trajectories = tuple(
         downsample(demonstration.trajectory, settings.downsampling, settings.num_steps)
         for demonstration in demonstrations
