@@ -187,7 +187,7 @@ def measure_speed(features: str, settings: DescriptorSettings, shape: tuple[int,
         "locate": lambda: extractor.locate(images[-1]),
         "describe": lambda: extractor.network_.describe(images[-1].rgb),
         "segment": lambda: make_view(images[-1], extractor.network_),
-        "register": lambda: register_all([thing.templates for thing in extractor.objects_], view),
+        "register": lambda: register_all([thing.model for thing in extractor.objects_], view),
     }
     if features == "efficientnet":
         work["fit"] = lambda: extractor.fit(images[:DEMONSTRATIONS])

@@ -14,7 +14,7 @@ from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.network import choose_network
-from robust_instant_policy.perception.objects import Registration, RigidObject, find_objects, register_all
+from robust_instant_policy.perception.objects import Registration, RigidObject, find_objects, register_all, without
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
 from robust_instant_policy.perception.relevance import MIN_RELEVANCE, relevances, shares, still
 from robust_instant_policy.perception.selection import select_points
@@ -90,23 +90,22 @@ class KeypointExtractor:
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
         objects = find_objects(views, self.seed)
-        common = [thing for thing in objects if thing.worst_fitness >= MIN_FITNESS]
-        if not common:
+        self.objects_ = without(objects, [thing.worst_fitness < MIN_FITNESS for thing in objects])
+        if not self.objects_:
             best = max((thing.worst_fitness for thing in objects), default=0.0)
             raise KeypointError(
                 f"the images have nothing in common: the best object of the first has a fitness of {best:.2f} in the "
                 f"worst other image (needed: {MIN_FITNESS:.2f}); do all demonstrations show the same object?"
             )
-        weights = _weights(common, views, trajectories)
+        weights = _weights(self.objects_, views, trajectories)
         counts = shares(weights, self.num_keypoints)
-        self.objects_ = [thing for thing, count in zip(common, counts, strict=True) if count]
-        if (left := int((weights > 0).sum()) - len(self.objects_)) > 0:
+        if (left := int(((weights > 0) & (np.array(counts) == 0)).sum())) > 0:
             notes.append(
-                f"{len(common)} objects were found for {self.num_keypoints} keypoints; {left} of them have none"
+                f"{len(self.objects_)} objects were found for {self.num_keypoints} keypoints; {left} of them have none"
             )
         self._places = []  # of each object's keypoints, in the first image
-        for thing, count in zip(self.objects_, filter(None, counts), strict=True):
-            points, replaced = select_points(thing, views, count, self.seed)
+        for thing, count in zip(self.objects_, counts, strict=True):
+            points, replaced = select_points(thing, views, count, self.seed) if count else (np.zeros((0, 3)), [])
             self._places.append(points)
             notes += replaced
         found = [self._locate(view, [t.registrations[i] for t in self.objects_]) for i, view in enumerate(views)]
@@ -121,7 +120,7 @@ class KeypointExtractor:
         Raises `KeypointError` where depth or foreground are missing.
         """
         view = make_view(observation, self.network_, self.workspace, self.seed)
-        return self._locate(view, register_all([thing.templates for thing in self.objects_], view))
+        return self._locate(view, register_all([thing.model for thing in self.objects_], view))
 
     def _locate(self, view: View, registrations: Sequence[Registration]) -> Located:
         """The keypoints of objects with known ``registrations`` in ``view``."""
@@ -129,7 +128,10 @@ class KeypointExtractor:
         expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
         points, pixels, measured = lift_to_surface(view.observation, view.depth, expected)
         counts = [len(places) for places in self._places]
-        confidence = np.repeat([(found.fitness + found.similarity) / 2 for found in registrations], counts)
+        confidence = np.repeat([found.score for found in registrations], counts)
+        confidence *= np.concatenate(
+            [found.certainty(places) for found, places in zip(registrations, self._places, strict=True)]
+        )
         confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / RESIDUAL_M**2)
         confidence[~measured] /= 2
         notes = list(view.notes)
@@ -147,7 +149,7 @@ def _weights(
     """Of objects ``(O,)``, for their numbers of keypoints."""
     places = [
         [
-            transform_points(view.to_world @ found.pose, thing.templates[0].xyzrgb[:, :3])
+            transform_points(view.to_world @ found.motion, thing.points)
             for view, found in zip(views, thing.registrations, strict=True)
         ]
         for thing in things
@@ -165,14 +167,14 @@ def _weights(
 
 def _expected_places(view: View, thing: RigidObject, places: FloatArray, found: Registration) -> FloatArray:
     """Where ``places (k, 3)`` of an object in the first image are in ``view``, metres, world."""
-    expected = transform_points(found.pose, places)
-    if found.fitness >= SAME_SHAPE_FITNESS:
+    expected = transform_points(found.motion, places)
+    if thing.model.varies or found.fitness >= SAME_SHAPE_FITNESS:
         return expected
     # An object of another size or articulation: register the neighbourhood of each keypoint.
-    template = thing.templates[0].xyzrgb
+    template = thing.model.templates[0].xyzrgb
     for k, place in enumerate(places):
         source = template[np.linalg.norm(template[:, :3] - place, axis=1) < NEIGHBOURHOOD_M]
         target = view.target[np.linalg.norm(view.target[:, :3] - expected[k], axis=1) < 2 * NEIGHBOURHOOD_M]
         if len(target):
-            expected[k] += register_translation(found.pose, source, target)
+            expected[k] += register_translation(found.motion, source, target)
     return expected

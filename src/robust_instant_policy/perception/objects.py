@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
+from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
+from robust_instant_policy.perception.parts import moving_part, unexplained_part
 from robust_instant_policy.perception.registration import (
     Candidates,
     Similarity,
     find_rivals,
+    fit_shape,
     refine,
+    rotated,
     settle_turn,
     vote_for_motions,
 )
@@ -26,12 +29,21 @@ MAX_TEMPLATE_CELLS = 80
 SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of other points of the object
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
+RIVAL_SCALE = 0.02  # of the score by which a motion is worse, for a weight of 1/e
+SAME_PLACE_M = 0.02
+MAX_OBJECTS = 30
+SHAPE_REACH_M = 0.03  # from an object: greatest distance of points of a larger one of its kind
+SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
+MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
+PART_TURNS = np.deg2rad(np.arange(-60.0, 90.0, 30.0))  # of a part against its object
+MAX_PART_TRAVEL_M = 0.2
 MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """An object in an image: ``pose (4, 4)`` from the reference image's world to the image's; ``fitness`` of its
+    """An object in an image: ``pose (4, 4)`` from the reference image's world to the image's, after the change of size
+    ``shape (4, 4)`` (`fit_shape`), together ``motion (4, 4)``; ``fitness`` of its
     points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones;
     ``rivals``: other motions that explain the image, the pose's own score first.
     """
@@ -41,10 +53,26 @@ class Registration:
     similarity: float
     template: int
     rivals: Candidates | None = None
+    shape: FloatArray = field(default_factory=lambda: np.eye(4))
+
+    @property
+    def motion(self) -> FloatArray:
+        return self.pose @ self.shape
 
     @property
     def score(self) -> float:
         return (self.fitness + self.similarity) / 2
+
+    def certainty(self, points: FloatArray) -> FloatArray:
+        """Share ``(N,)``, in [0, 1], of the motions, weighted by how well they explain the image, that put ``points
+        (N, 3)`` of the reference image where this one does.
+        """
+        if self.rivals is None or not len(points):
+            return np.ones(len(points))
+        weights = np.exp(np.minimum(self.rivals.score - self.rivals.score[0], 0) / RIVAL_SCALE)
+        places = points @ np.swapaxes(self.rivals.motions[:, :3, :3], 1, 2) + self.rivals.motions[:, None, :3, 3]
+        same = np.linalg.norm(places - places[0], axis=2) < SAME_PLACE_M
+        return (weights[:, None] * same).sum(axis=0) / weights.sum()
 
 
 IN_REFERENCE = Registration(np.eye(4), 1.0, 1.0, 0)
@@ -63,13 +91,32 @@ class Template:
 
 
 @dataclass(frozen=True, eq=False)
-class RigidObject:
-    """An object of the reference image: a template of every image in which it was seen, the reference's first, and
-    its ``registrations`` in all images.
+class Model:
+    """What an object looks like: its ``templates``, the reference image's first; ``parent``: for a part that moves
+    against the rest of an object, the number of that, otherwise -1; whether it ``varies`` in size between images.
     """
 
     templates: tuple[Template, ...]
+    parent: int = -1
+    varies: bool = False
+
+    @property
+    def points(self) -> FloatArray:
+        """``(N, 3)`` in the reference image, metres."""
+        return self.templates[0].xyzrgb[:, :3].astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class RigidObject:
+    """An object of the reference image: its ``model``, and its ``registrations`` in all images."""
+
+    model: Model
     registrations: tuple[Registration, ...]
+
+    @property
+    def points(self) -> FloatArray:
+        """``(N, 3)`` in the reference image, metres."""
+        return self.model.points
 
     @property
     def worst_fitness(self) -> float:
@@ -77,62 +124,156 @@ class RigidObject:
 
 
 def find_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
-    """The pieces of the first view, registered in all ``views``."""
-    home = views[0]
-    models = [
-        (_template(home, np.eye(4), points := home.xyzrgb[subsample(piece, MAX_TEMPLATE_POINTS, seed)], points, seed),)
-        for piece in home.pieces
-        if len(piece) >= MIN_FOREGROUND_POINTS
-    ]
-    found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
-    things = []
-    for number, model in enumerate(models):
-        templates, registrations = list(model), [row[number] for row in found]
-        for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
-            better = [k for k in range(len(models)) if found[i][k].score > found[i][number].score]
-            taken = _explained(models, found[i], better)
-            registrations[i] = register(templates, views[i], taken)
-            templates += _another_template(views[i], registrations[i], templates, seed)
-        things.append(RigidObject(tuple(templates), tuple(registrations)))
-    return things
+    """The rigid objects of the first view, registered in all ``views``.
 
-
-def register_all(models: Sequence[Sequence[Template]], view: View) -> list[Registration]:
-    """Find all objects, each given by its templates, in ``view``, so that no two explain the same points of it.
-
-    Each is registered on its own. From the best one on, an object that explains points of better ones is registered
-    again without those.
+    A piece of the first view is one object, or several if parts of it move differently in the other views.
     """
-    found = [register(templates, view) for templates in models]
+    home = views[0]
+    pieces = [piece for piece in home.pieces if len(piece) >= MIN_FOREGROUND_POINTS]
+    models = [Model((_template_of(home, piece, seed),)) for piece in pieces]
+    found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
+    number = 0
+    while number < len(models) and len(views) > 1:
+        wholes = [row[number] for row in found[1:]]
+        poses = [whole.motion for whole in wholes]
+        part = unexplained_part(home.points[pieces[number]], views[1:], poses)
+        if part.any() and len(models) < MAX_OBJECTS:
+            rest, own = (Model((_template_of(home, pieces[number][which], seed),)) for which in (~part, part))
+            pairs = [_register_pair(rest, own, view, whole.pose) for view, whole in zip(views[1:], wholes, strict=True)]
+            part = moving_part(
+                home.points[pieces[number]],
+                part,
+                views[1:],
+                [one.motion for one, _ in pairs],
+                [other.motion for _, other in pairs],
+                poses,
+            )
+            if part.any():
+                models[number] = Model((_template_of(home, pieces[number][~part], seed),), models[number].parent)
+                models.append(Model((_template_of(home, pieces[number][part], seed),), number))
+                pieces.append(pieces[number][part])
+                pieces[number] = pieces[number][~part]
+                found[0].append(IN_REFERENCE)
+                for row, (one, other) in zip(found[1:], pairs, strict=True):
+                    row[number] = one
+                    row.append(other)
+                continue
+        number += 1
+    things = [_complete(models, found, number, views, seed) for number in range(len(models))]
+    shapes = [_shapes([thing.model for thing in things], [thing.registrations[i] for thing in things], view) for i, view in enumerate(views)]
+    return [
+        thing if not varies else _with_shapes(thing, [row[number] for row in shapes])
+        for number, (thing, varies) in enumerate(zip(things, _vary(np.array(shapes)), strict=True))
+    ]
+
+
+def _vary(shapes: FloatArray) -> NDArray[np.bool_]:
+    """Which objects ``(O,)`` differ in size between images, from their ``shapes (I, O, 4, 4)``."""
+    if len(shapes) < MIN_IMAGES_OF_KIND:
+        return np.zeros(shapes.shape[1], dtype=bool)
+    stretch = np.abs(np.log(np.linalg.eigvalsh(shapes[1:, :, :3, :3]))).max(axis=2)
+    return np.median(stretch, axis=0) > SAME_SIZE
+
+
+def _with_shapes(thing: RigidObject, shapes: Sequence[FloatArray]) -> RigidObject:
+    """``thing``, which differs in size, with its ``shapes`` in all images."""
+    pairs = zip(thing.registrations, shapes, strict=True)
+    return replace(thing, model=replace(thing.model, varies=True), registrations=tuple(replace(r, shape=s) for r, s in pairs))
+
+
+def _shapes(models: Sequence[Model], found: Sequence[Registration], view: View) -> list[FloatArray]:
+    """The change of size ``(4, 4)`` of each object: image points belong to the nearest."""
+    if not models:
+        return []
+    points = view.target[:, :3].astype(np.float64)
+    moved = [transform_points(one.pose, model.points) for model, one in zip(models, found, strict=True)]
+    distances = np.array([cKDTree(one).query(points)[0] for one in moved])
+    owner = np.where(distances.min(axis=0) < SHAPE_REACH_M, distances.argmin(axis=0), -1)
+    return [
+        fit_shape(one.pose, model.points, points[owner == i])
+        for i, (model, one) in enumerate(zip(models, found, strict=True))
+    ]
+
+
+def without(things: Sequence[RigidObject], dropped: Sequence[bool]) -> list[RigidObject]:
+    """``things`` without those ``dropped``; their parts stand alone."""
+    new_number = np.where(dropped, -1, np.cumsum(~np.array(dropped)) - 1)
+    return [
+        replace(thing, model=replace(thing.model, parent=int(new_number[thing.model.parent]) if thing.model.parent >= 0 else -1))
+        for thing, drop in zip(things, dropped, strict=True)
+        if not drop
+    ]
+
+
+def _register_pair(rest: Model, part: Model, view: View, pose: FloatArray) -> tuple[Registration, Registration]:
+    """Both in ``view``, where the whole has ``pose (4, 4)``; the part apart from what the rest explains."""
+    first = register(rest.templates, view, near=pose)
+    return first, register(part.templates, view, _explained([rest], [first], [0]), near=first.pose, is_part=True)
+
+
+def _complete(
+    models: Sequence[Model], found: Sequence[Sequence[Registration]], number: int, views: Sequence[View], seed: int
+) -> RigidObject:
+    """Object ``number`` with templates from all views, and registered with them; the best views come first."""
+    model, registrations = models[number], [row[number] for row in found]
+    templates = list(model.templates)
+    for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
+        better = [k for k in range(len(models)) if found[i][k].score > found[i][number].score]
+        taken = _explained(models, found[i], better)
+        is_part = model.parent >= 0
+        near = found[i][model.parent].pose if is_part else registrations[i].pose
+        registrations[i] = register(templates, views[i], taken, near, is_part)
+        templates += _another_template(views[i], registrations[i], templates, seed)
+    return RigidObject(Model(tuple(templates), model.parent), tuple(registrations))
+
+
+def register_all(models: Sequence[Model], view: View) -> list[Registration]:
+    """Find all objects in ``view``, so that no two explain the same points of it.
+
+    Each is registered on its own, a part near its object. From the best one on, an object that explains points of
+    better ones is registered again without those.
+    """
+    found: list[Registration] = []
+    for model in models:  # a part comes after its object
+        near = found[model.parent].pose if model.parent >= 0 else None
+        found.append(register(model.templates, view, None, near, model.parent >= 0))
     tree = cKDTree(view.target[:, :3])
     taken = np.zeros(len(view.target), dtype=bool)
     settled: list[int] = []
     for i in sorted(range(len(models)), key=lambda i: -found[i].score):
         if _shared(tree, taken, models[i], found[i]) > MAX_SHARED:
-            again = register(models[i], view, _explained(models, found, settled))
-            options = [replace(one, fitness=one.fitness * (1 - _shared(tree, taken, models[i], one))) for one in (found[i], again)]
+            parent = models[i].parent
+            near = found[parent].pose if parent >= 0 else None
+            again = register(models[i].templates, view, _explained(models, found, settled), near, parent >= 0)
+            options = [
+                replace(one, fitness=one.fitness * (1 - _shared(tree, taken, models[i], one)))
+                for one in (found[i], again)
+            ]
             found[i] = max(options, key=lambda one: one.score)
         settled.append(i)
         taken[_claim(tree, models[i], found[i])] = True
+    if any(model.varies for model in models):
+        pairs = zip(models, found, _shapes(models, found, view), strict=True)
+        found = [replace(one, shape=shape) if model.varies else one for model, one, shape in pairs]
     return found
 
 
-def _explained(models: Sequence[Sequence[Template]], found: Sequence[Registration], which: Sequence[int]) -> FloatArray:
+def _explained(models: Sequence[Model], found: Sequence[Registration], which: Sequence[int]) -> FloatArray:
     """Points ``(N, 3)`` of the objects ``which``, where they were found."""
-    moved = [transform_points(found[i].pose, models[i][found[i].template].xyzrgb[:, :3]) for i in which]
+    moved = [transform_points(found[i].motion, models[i].templates[found[i].template].xyzrgb[:, :3]) for i in which]
     return np.concatenate([np.zeros((0, 3)), *moved])
 
 
-def _claim(tree: cKDTree, templates: Sequence[Template], found: Registration) -> IntArray:
+def _claim(tree: cKDTree, model: Model, found: Registration) -> IntArray:
     """Numbers of the points in ``tree`` that an object explains."""
-    moved = transform_points(found.pose, templates[found.template].xyzrgb[:, :3])
+    moved = transform_points(found.motion, model.templates[found.template].xyzrgb[:, :3])
     near = tree.query_ball_point(moved, CLAIM_M)
     return np.unique(np.concatenate([np.asarray(one, dtype=np.intp) for one in near]))
 
 
-def _shared(tree: cKDTree, taken: NDArray[np.bool_], templates: Sequence[Template], found: Registration) -> float:
+def _shared(tree: cKDTree, taken: NDArray[np.bool_], model: Model, found: Registration) -> float:
     """Share of the points that an object explains that are ``taken (M,)``."""
-    claimed = _claim(tree, templates, found)
+    claimed = _claim(tree, model, found)
     return float(taken[claimed].mean()) if len(claimed) else 0.0
 
 
@@ -140,7 +281,7 @@ def _another_template(
     view: View, found: Registration, templates: Sequence[Template], seed: int
 ) -> list[Template]:
     """The object as ``view`` shows it, or nothing where it does not."""
-    to_reference = invert_pose(found.pose)
+    to_reference = np.linalg.inv(found.motion)
     known = templates[found.template].xyzrgb
     points = transform_points(to_reference, view.target[:, :3])
     same = cKDTree(known[:, :3]).query(points)[0] < SAME_OBJECT_M
@@ -148,6 +289,12 @@ def _another_template(
         return []
     seen = np.concatenate([points, view.target[:, 3:]], axis=1)[same].astype(np.float32)
     return [_template(view, to_reference, seen, known, seed)]
+
+
+def _template_of(home: View, piece: IntArray, seed: int) -> Template:
+    """Of the points ``piece`` of the reference image."""
+    points = home.xyzrgb[subsample(piece, MAX_TEMPLATE_POINTS, seed)]
+    return _template(home, np.eye(4), points, points, seed)
 
 
 def _template(view: View, to_reference: FloatArray, xyzrgb: Float32Array, known: Float32Array, seed: int) -> Template:
@@ -158,8 +305,17 @@ def _template(view: View, to_reference: FloatArray, xyzrgb: Float32Array, known:
     return Template(view, xyzrgb[kept], view.cells[near], points[near])
 
 
-def register(templates: Sequence[Template], view: View, taken: FloatArray | None = None) -> Registration:
-    """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world."""
+def register(
+    templates: Sequence[Template],
+    view: View,
+    taken: FloatArray | None = None,
+    near: FloatArray | None = None,
+    is_part: bool = False,
+) -> Registration:
+    """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world.
+
+    ``near (4, 4)``: another motion to start from; a part moves little against that.
+    """
     target, free = view.target, np.arange(len(view.cell_points))
     if taken is not None and len(taken):
         others = cKDTree(taken)
@@ -171,6 +327,12 @@ def register(templates: Sequence[Template], view: View, taken: FloatArray | None
     with_foreground = [table[:, free] for table in similar]
     points = np.concatenate([template.points for template in templates])
     motions = vote_for_motions(points, view.cell_points[free], np.concatenate(with_foreground))
+    if near is not None:
+        centre = points.mean(axis=0)
+        motions = np.concatenate([rotated(near, centre, PART_TURNS if is_part else np.zeros(1)), motions])
+        if is_part:
+            travel = np.linalg.norm((motions[:, :3, :3] @ centre + motions[:, :3, 3]) - transform_points(near, centre), axis=1)
+            motions = motions[travel < MAX_PART_TRAVEL_M]
     index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
     source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
     candidates = refine(motions, source, target, similarity)

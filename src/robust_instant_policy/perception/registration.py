@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robust_instant_policy.geometry import FloatArray, fit_upright, rotations_about_vertical, transform_points
+from robust_instant_policy.geometry import FloatArray, fit_upright, invert_pose, rotations_about_vertical, transform_points
 from robust_instant_policy.perception.descriptors import Float32Array
 
 # Votes.
@@ -43,6 +43,12 @@ SIMILARITY_SCALE = 0.01  # of the softmax over small turns
 LARGE_TURNS = np.deg2rad(np.arange(30.0, 360.0, 30.0))
 SLIDES_M = 0.025 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
 RIVAL_REACH_M = (0.02, 0.015)
+
+# Shape.
+MIN_SHAPE_POINTS = 25
+EXTENT_PERCENTILES = (2.0, 98.0)
+MIN_EXTENT_M = 0.01  # flatter things are not stretched
+MAX_STRETCH = 1.4
 
 Similarity = Callable[[FloatArray], FloatArray]
 
@@ -134,6 +140,31 @@ def find_rivals(motion: FloatArray, source: Float32Array, target: Float32Array, 
     turned = icp(turned, *coarse, RIVAL_REACH_M)[0]
     motions = np.concatenate([motion[None], turned, slid])
     return Candidates(motions, icp(motions, *coarse, ())[1], similarity(motions))
+
+
+def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
+    """How an object of the same kind differs in size: an affine map ``(4, 4)`` of its own frame, before ``motion``, that
+    stretches ``source (N, 3)`` along its horizontal axes and upward to the extent of the image's points ``goals (M, 3)``.
+    """
+    goals = transform_points(invert_pose(motion), goals)
+    shape = np.eye(4)
+    if len(goals) < MIN_SHAPE_POINTS:
+        return shape
+    axes = horizontal_axes(source)
+    lower, upper = np.percentile(source @ axes.T, EXTENT_PERCENTILES, axis=0)
+    new_lower, new_upper = np.percentile(goals @ axes.T, EXTENT_PERCENTILES, axis=0)
+    scale = (new_upper - new_lower) / np.maximum(upper - lower, MIN_EXTENT_M)
+    scale = np.where(upper - lower < MIN_EXTENT_M, 1, scale.clip(1 / MAX_STRETCH, MAX_STRETCH))
+    shape[:3, :3] = axes.T @ np.diag(scale) @ axes
+    shape[:3, 3] = axes.T @ ((new_lower + new_upper) / 2 - scale * (lower + upper) / 2)
+    return shape
+
+
+def horizontal_axes(points: FloatArray) -> FloatArray:
+    """Rows ``(3, 3)``: the sides of the smallest upright box around ``points (N, 3)``."""
+    turns = rotations_about_vertical(np.deg2rad(np.arange(0.0, 90.0, 3.0)))
+    extent = np.diff(np.percentile(points @ np.swapaxes(turns, 1, 2), EXTENT_PERCENTILES, axis=1), axis=0)[0]
+    return turns[(extent[:, 0] * extent[:, 1]).argmin()]
 
 
 def _coarse(source: Float32Array, target: Float32Array) -> tuple[Float32Array, Float32Array]:

@@ -132,7 +132,7 @@ def make_view(
         observation = replace(observation, camera_pose=to_level @ observation.camera_pose)
     footprint = GAP_PX * stride * float(np.nanmedian(depth)) / observation.intrinsics[0, 0]
     foreground = np.flatnonzero(label == 0)
-    label[foreground] = _pieces(points[foreground], max(GAP_M, footprint))
+    label[foreground] = connected_pieces(points[foreground], max(GAP_M, footprint))
     _join_hidden(label, points, usable)
     small = _leave_out(label, heights, pixels)
 
@@ -193,7 +193,7 @@ def _unlike_table(
     return raised | (flat & unlike & (descriptors.saliency.flat[descriptors.cells_at(pixels)] > salient))
 
 
-def _pieces(points: FloatArray, gap: float) -> IntArray:
+def connected_pieces(points: FloatArray, gap: float) -> IntArray:
     """Number ``(N,)`` of the piece of each of ``points (N, 3)``: chains of points less than ``gap`` apart."""
     if not len(points):
         return np.zeros(0, dtype=np.intp)
