@@ -14,7 +14,7 @@ from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.network import choose_network
-from robust_instant_policy.perception.objects import Registration, RigidObject, find_objects, register_all, without
+from robust_instant_policy.perception.objects import MIN_FITNESS, Registration, RigidObject, find_objects, register_all, without
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
 from robust_instant_policy.perception.relevance import MIN_RELEVANCE, relevances, shares, still
 from robust_instant_policy.perception.selection import select_points
@@ -22,7 +22,6 @@ from robust_instant_policy.perception.settings import DescriptorSettings, paper_
 from robust_instant_policy.perception.view import View, make_view
 from robust_instant_policy.trajectory import Trajectory
 
-MIN_FITNESS = 0.15  # of an object's registration in every demonstration
 SAME_SHAPE_FITNESS = 0.7  # from which keypoints need no registration of their own
 SCENERY_WEIGHT = 0.2  # of what never moves, beside what does
 NEIGHBOURHOOD_M = 0.04  # around a keypoint, for a registration of its own

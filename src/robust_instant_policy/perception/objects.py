@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from robust_instant_policy.geometry import FloatArray, project, transform_points
+from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
-from robust_instant_policy.perception.parts import moving_part, unexplained_part
+from robust_instant_policy.perception.parts import MIN_GAIN, candidate_parts, gain
 from robust_instant_policy.perception.registration import (
     Candidates,
     Similarity,
@@ -31,12 +31,15 @@ BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
 RIVAL_SCALE = 0.02  # of the score by which a motion is worse, for a weight of 1/e
 SAME_PLACE_M = 0.02
+MIN_FITNESS = 0.15  # of an object's registration in every demonstration
 MAX_OBJECTS = 30
 SHAPE_REACH_M = 0.03  # from an object: greatest distance of points of a larger one of its kind
 SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
 MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
 PART_TURNS = np.deg2rad(np.arange(-60.0, 90.0, 30.0))  # of a part against its object
+FAMILY_TURNS = np.zeros(1)  # of an object against itself with its parts
 MAX_PART_TRAVEL_M = 0.2
+TOUCH_M = 0.03
 MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one
 
 
@@ -93,11 +96,13 @@ class Template:
 @dataclass(frozen=True, eq=False)
 class Model:
     """What an object looks like: its ``templates``, the reference image's first; ``parent``: for a part that moves
-    against the rest of an object, the number of that, otherwise -1; whether it ``varies`` in size between images.
+    against the rest of an object, the number of that, otherwise -1; ``family``: templates of an object with all its
+    parts, which tell its turn where it alone is symmetric; whether it ``varies`` in size between images.
     """
 
     templates: tuple[Template, ...]
     parent: int = -1
+    family: tuple[Template, ...] = ()
     varies: bool = False
 
     @property
@@ -134,37 +139,51 @@ def find_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
     found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
     number = 0
     while number < len(models) and len(views) > 1:
-        wholes = [row[number] for row in found[1:]]
-        poses = [whole.motion for whole in wholes]
-        part = unexplained_part(home.points[pieces[number]], views[1:], poses)
-        if part.any() and len(models) < MAX_OBJECTS:
-            rest, own = (Model((_template_of(home, pieces[number][which], seed),)) for which in (~part, part))
-            pairs = [_register_pair(rest, own, view, whole.pose) for view, whole in zip(views[1:], wholes, strict=True)]
-            part = moving_part(
-                home.points[pieces[number]],
-                part,
-                views[1:],
-                [one.motion for one, _ in pairs],
-                [other.motion for _, other in pairs],
-                poses,
-            )
-            if part.any():
-                models[number] = Model((_template_of(home, pieces[number][~part], seed),), models[number].parent)
-                models.append(Model((_template_of(home, pieces[number][part], seed),), number))
-                pieces.append(pieces[number][part])
-                pieces[number] = pieces[number][~part]
-                found[0].append(IN_REFERENCE)
-                for row, (one, other) in zip(found[1:], pairs, strict=True):
-                    row[number] = one
-                    row.append(other)
-                continue
-        number += 1
+        if models[number].parent >= 0:  # parts have no parts
+            number += 1
+            continue
+        split = _split(home, pieces[number], views[1:], [row[number] for row in found[1:]], seed)
+        if split is None or len(models) >= MAX_OBJECTS:
+            number += 1
+            continue
+        rest, part, pairs = split
+        models[number] = replace(models[number], templates=(_template_of(home, rest, seed),))
+        models.append(Model((_template_of(home, part, seed),), number))
+        pieces[number] = rest
+        pieces.append(part)
+        found[0].append(IN_REFERENCE)
+        for row, (of_rest, of_part) in zip(found[1:], pairs, strict=True):
+            row[number] = of_rest
+            row.append(of_part)
+    models = _attached(models, [len(piece) for piece in pieces], found)
+    for number in {model.parent for model in models} - {-1}:
+        members = [i for i, model in enumerate(models) if i == number or model.parent == number]
+        family = (_template_of(home, np.concatenate([pieces[i] for i in members]), seed),)
+        models[number] = replace(models[number], family=family)
     things = [_complete(models, found, number, views, seed) for number in range(len(models))]
     shapes = [_shapes([thing.model for thing in things], [thing.registrations[i] for thing in things], view) for i, view in enumerate(views)]
     return [
         thing if not varies else _with_shapes(thing, [row[number] for row in shapes])
         for number, (thing, varies) in enumerate(zip(things, _vary(np.array(shapes)), strict=True))
     ]
+
+
+def _attached(models: Sequence[Model], sizes: Sequence[int], found: Sequence[Sequence[Registration]]) -> list[Model]:
+    """``models``, where what touches a larger object and stays near it in most images is a part of that."""
+    attached = list(models)
+    if len(found) < MIN_IMAGES_OF_KIND:
+        return attached
+    for i, model in enumerate(models):
+        centre = model.points.mean(axis=0)
+        for k, other in enumerate(attached):
+            if attached[i].parent >= 0 or other.parent >= 0 or sizes[k] <= sizes[i] or k == i:
+                continue
+            if any(one.parent == i for one in attached) or cKDTree(other.points).query(model.points)[0].min() > TOUCH_M:
+                continue
+            moved = [transform_points(invert_pose(row[k].pose) @ row[i].pose, centre) - centre for row in found[1:]]
+            if np.median(np.linalg.norm(moved, axis=1)) < MAX_PART_TRAVEL_M / 2:
+                attached[i] = replace(model, parent=k)
+    return attached
 
 
 def _vary(shapes: FloatArray) -> NDArray[np.bool_]:
@@ -205,10 +224,30 @@ def without(things: Sequence[RigidObject], dropped: Sequence[bool]) -> list[Rigi
     ]
 
 
-def _register_pair(rest: Model, part: Model, view: View, pose: FloatArray) -> tuple[Registration, Registration]:
-    """Both in ``view``, where the whole has ``pose (4, 4)``; the part apart from what the rest explains."""
-    first = register(rest.templates, view, near=pose)
-    return first, register(part.templates, view, _explained([rest], [first], [0]), near=first.pose, is_part=True)
+Pair = tuple[Registration, Registration]
+
+
+def _split(
+    home: View, piece: IntArray, views: Sequence[View], found: Sequence[Registration], seed: int
+) -> tuple[IntArray, IntArray, list[Pair]] | None:
+    """The rest of a ``piece`` of the first view and a part of it that moves differently, with the registrations of both
+    in ``views``; None if it is rigid. ``found``: the registrations of the whole.
+    """
+    motions = [one.pose for one in found]
+    best, split = MIN_GAIN, None
+    for part in candidate_parts(home, piece, views, motions):
+        rest_model, part_model = (Model((_template_of(home, piece[which], seed),)) for which in (~part, part))
+        pairs = []
+        for view, whole in zip(views, found, strict=True):
+            rest = register(rest_model.templates, view, near=whole.pose)
+            taken = _explained([rest_model], [rest], [0])
+            pairs.append((rest, register(part_model.templates, view, taken, rest.pose, PART_TURNS)))
+        if min(own.fitness for _, own in pairs) < MIN_FITNESS:
+            continue
+        gained = gain(home.points[piece[part]], views, motions, [own.pose for _, own in pairs])
+        if gained > best:
+            best, split = gained, (piece[~part], piece[part], pairs)
+    return split
 
 
 def _complete(
@@ -220,11 +259,26 @@ def _complete(
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
         better = [k for k in range(len(models)) if found[i][k].score > found[i][number].score]
         taken = _explained(models, found[i], better)
-        is_part = model.parent >= 0
-        near = found[i][model.parent].pose if is_part else registrations[i].pose
-        registrations[i] = register(templates, views[i], taken, near, is_part)
+        grown = replace(model, templates=tuple(templates))
+        registrations[i] = _register_model(grown, views[i], found[i], taken, registrations[i].pose)
         templates += _another_template(views[i], registrations[i], templates, seed)
-    return RigidObject(Model(tuple(templates), model.parent), tuple(registrations))
+    return RigidObject(replace(model, templates=tuple(templates)), tuple(registrations))
+
+
+def _register_model(
+    model: Model,
+    view: View,
+    found: Sequence[Registration] | Mapping[int, Registration],
+    taken: FloatArray | None = None,
+    near: FloatArray | None = None,
+) -> Registration:
+    """One object: a part near its parent, which was ``found``, and an object with parts where they fit, too."""
+    if model.parent >= 0:
+        return register(model.templates, view, taken, found[model.parent].pose, PART_TURNS)
+    if model.family:
+        family = register(model.family, view, taken)
+        return register(model.templates, view, taken, family.pose, FAMILY_TURNS, alone=False)
+    return register(model.templates, view, taken, near)
 
 
 def register_all(models: Sequence[Model], view: View) -> list[Registration]:
@@ -233,18 +287,15 @@ def register_all(models: Sequence[Model], view: View) -> list[Registration]:
     Each is registered on its own, a part near its object. From the best one on, an object that explains points of
     better ones is registered again without those.
     """
-    found: list[Registration] = []
-    for model in models:  # a part comes after its object
-        near = found[model.parent].pose if model.parent >= 0 else None
-        found.append(register(model.templates, view, None, near, model.parent >= 0))
+    found: dict[int, Registration] = {}
+    for i in sorted(range(len(models)), key=lambda i: models[i].parent >= 0):  # parts come after their objects
+        found[i] = _register_model(models[i], view, found)
     tree = cKDTree(view.target[:, :3])
     taken = np.zeros(len(view.target), dtype=bool)
     settled: list[int] = []
     for i in sorted(range(len(models)), key=lambda i: -found[i].score):
         if _shared(tree, taken, models[i], found[i]) > MAX_SHARED:
-            parent = models[i].parent
-            near = found[parent].pose if parent >= 0 else None
-            again = register(models[i].templates, view, _explained(models, found, settled), near, parent >= 0)
+            again = _register_model(models[i], view, found, _explained(models, found, settled))
             options = [
                 replace(one, fitness=one.fitness * (1 - _shared(tree, taken, models[i], one)))
                 for one in (found[i], again)
@@ -252,13 +303,16 @@ def register_all(models: Sequence[Model], view: View) -> list[Registration]:
             found[i] = max(options, key=lambda one: one.score)
         settled.append(i)
         taken[_claim(tree, models[i], found[i])] = True
-    if any(model.varies for model in models):
-        pairs = zip(models, found, _shapes(models, found, view), strict=True)
-        found = [replace(one, shape=shape) if model.varies else one for model, one, shape in pairs]
-    return found
+    result = [found[i] for i in range(len(models))]
+    if not any(model.varies for model in models):
+        return result
+    pairs = zip(models, result, _shapes(models, result, view), strict=True)
+    return [replace(one, shape=shape) if model.varies else one for model, one, shape in pairs]
 
 
-def _explained(models: Sequence[Model], found: Sequence[Registration], which: Sequence[int]) -> FloatArray:
+def _explained(
+    models: Sequence[Model], found: Sequence[Registration] | Mapping[int, Registration], which: Sequence[int]
+) -> FloatArray:
     """Points ``(N, 3)`` of the objects ``which``, where they were found."""
     moved = [transform_points(found[i].motion, models[i].templates[found[i].template].xyzrgb[:, :3]) for i in which]
     return np.concatenate([np.zeros((0, 3)), *moved])
@@ -310,11 +364,13 @@ def register(
     view: View,
     taken: FloatArray | None = None,
     near: FloatArray | None = None,
-    is_part: bool = False,
+    turns: FloatArray | None = None,
+    alone: bool = True,
 ) -> Registration:
     """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world.
 
-    ``near (4, 4)``: another motion to start from; a part moves little against that.
+    ``near (4, 4)``: another motion to start from. With ``turns (A,)`` it is turned by these, and those from elsewhere
+    are left out; unless ``alone``, all others are.
     """
     target, free = view.target, np.arange(len(view.cell_points))
     if taken is not None and len(taken):
@@ -326,13 +382,15 @@ def register(
     similar = [t.view.descriptors.similarities(t.cells, view.descriptors, view.cells) for t in templates]
     with_foreground = [table[:, free] for table in similar]
     points = np.concatenate([template.points for template in templates])
-    motions = vote_for_motions(points, view.cell_points[free], np.concatenate(with_foreground))
+    motions = np.zeros((0, 4, 4))
+    if alone:
+        motions = vote_for_motions(points, view.cell_points[free], np.concatenate(with_foreground))
     if near is not None:
         centre = points.mean(axis=0)
-        motions = np.concatenate([rotated(near, centre, PART_TURNS if is_part else np.zeros(1)), motions])
-        if is_part:
-            travel = np.linalg.norm((motions[:, :3, :3] @ centre + motions[:, :3, 3]) - transform_points(near, centre), axis=1)
-            motions = motions[travel < MAX_PART_TRAVEL_M]
+        motions = np.concatenate([rotated(near, centre, np.zeros(1) if turns is None else turns), motions])
+        if turns is not None:
+            travel = motions[:, :3, :3] @ centre + motions[:, :3, 3] - transform_points(near, centre)
+            motions = motions[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
     index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
     source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
     candidates = refine(motions, source, target, similarity)

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
+from robust_instant_policy.perception.descriptors import IntArray
 from robust_instant_policy.perception.view import GAP_M, MIN_FOREGROUND_POINTS, View, connected_pieces
 
 UNEXPLAINED_M = 0.008  # distance from the surfaces of the other images
@@ -16,56 +18,52 @@ PERCENTILE = 75.0  # over the images: a part need not move in all of them
 GREATEST_M = 0.05  # distance that counts
 HIDDEN_M = 0.02  # behind the surface that the image shows there
 SMOOTHING_POINTS = 8
+THIN = 0.5  # of the greatest radius of a circle inside a piece
 MIN_SHARE = 0.05  # of a piece's points
-MIN_GAIN = 0.5  # of the distances, by a motion of its own
+MIN_GAIN = 0.4  # of the distances, by a motion of its own
+MIN_DISTANCE_M = 0.004  # mean; less is the noise of the depth
 
 BoolArray = NDArray[np.bool_]
 
 
-def unexplained_part(points: FloatArray, views: Sequence[View], poses: Sequence[FloatArray]) -> BoolArray:
-    """The largest connected part of ``points (N, 3)`` that one rigid motion ``poses`` into each of ``views`` leaves off
-    the surfaces there; empty if it is small, or nearly all.
+def candidate_parts(home: View, piece: IntArray, views: Sequence[View], motions: Sequence[FloatArray]) -> list[BoolArray]:
+    """Parts ``(N,)`` of a ``piece (N,)`` of the image ``home`` that may move against the rest: those that are thin, and
+    those that the ``motions`` of the whole into each of ``views`` leave off the surfaces there.
     """
-    none = np.zeros(len(points), dtype=bool)
-    off = np.flatnonzero(_distances(points, views, poses) > UNEXPLAINED_M)
-    if len(off) < MIN_FOREGROUND_POINTS:
-        return none
-    number = connected_pieces(points[off], GAP_M)
-    part = none.copy()
-    part[off[number == np.bincount(number).argmax()]] = True
-    return part if _is_large(part) else none
+    off = _distances(home.points[piece], views, motions) > UNEXPLAINED_M
+    parts = [*_connected(home, piece, _thin(home, piece)), *_connected(home, piece, off)[:1]]
+    return [part for part in parts if part.sum() <= len(piece) / 2]
 
 
-def moving_part(
-    points: FloatArray,
-    part: BoolArray,
-    views: Sequence[View],
-    rest_poses: Sequence[FloatArray],
-    part_poses: Sequence[FloatArray],
-    whole_poses: Sequence[FloatArray],
-) -> BoolArray:
-    """Those of ``points (N, 3)`` that the motions of a ``part (N,)`` explain better than those of the rest.
+def _thin(home: View, piece: IntArray) -> BoolArray:
+    """Which points of a ``piece (N,)`` are not within its thick core, as the image shows it."""
+    place = np.flatnonzero(home.labels >= 0)[piece]
+    mask = np.zeros(home.labels.shape, dtype=bool)
+    mask.flat[place] = True
+    depth = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    radius = THIN * depth.max()
+    return distance_transform_edt(depth <= radius).flat[place] > radius + 1
 
-    Empty where the part's own motions do not explain it much better than the whole's.
+
+def _connected(home: View, piece: IntArray, which: BoolArray) -> list[BoolArray]:
+    """The connected parts ``(N,)`` of those points of a ``piece (N,)``, the largest first, that are large enough."""
+    chosen = np.flatnonzero(which)
+    number = connected_pieces(home.points[piece[chosen]], GAP_M)
+    parts = []
+    for members in sorted((chosen[number == n] for n in np.unique(number)), key=len, reverse=True):
+        if len(members) >= max(MIN_FOREGROUND_POINTS, MIN_SHARE * len(piece)):
+            parts.append(np.isin(np.arange(len(piece)), members))
+    return parts
+
+
+def gain(
+    points: FloatArray, views: Sequence[View], whole: Sequence[FloatArray], own: Sequence[FloatArray]
+) -> float:
+    """Share by which the distances of a part's ``points (N, 3)`` from the surfaces in ``views`` become smaller with its
+    ``own`` motions than with those of the ``whole``; 0 where those explain it.
     """
-    own = _distances(points, views, part_poses)
-    before = _distances(points, views, whole_poses)
-    none = np.zeros(len(points), dtype=bool)
-    if own[part].mean() > (1 - MIN_GAIN) * before[part].mean():
-        return none
-    better = own < _distances(points, views, rest_poses)
-    inside = np.flatnonzero(better | part)
-    number = connected_pieces(points[inside], GAP_M)
-    grown = none.copy()
-    grown[inside[number == np.bincount(number[part[inside]]).argmax()]] = True
-    grown &= better
-    return grown if _is_large(grown) else none
-
-
-def _is_large(part: BoolArray) -> bool:
-    """Whether both a part and the rest are large enough to be registered."""
-    least = max(MIN_FOREGROUND_POINTS, MIN_SHARE * len(part))
-    return least <= part.sum() <= len(part) - least
+    before = _distances(points, views, whole).mean()
+    return 0.0 if before < MIN_DISTANCE_M else 1 - float(_distances(points, views, own).mean() / before)
 
 
 def _distances(points: FloatArray, views: Sequence[View], poses: Sequence[FloatArray]) -> FloatArray:

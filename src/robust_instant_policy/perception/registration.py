@@ -144,7 +144,7 @@ def find_rivals(motion: FloatArray, source: Float32Array, target: Float32Array, 
 
 def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
     """How an object of the same kind differs in size: an affine map ``(4, 4)`` of its own frame, before ``motion``, that
-    stretches ``source (N, 3)`` along its horizontal axes and upward to the extent of the image's points ``goals (M, 3)``.
+    stretches ``source (N, 3)`` along its horizontal axes, and lifts it, to the extent of the points ``goals (M, 3)``.
     """
     goals = transform_points(invert_pose(motion), goals)
     shape = np.eye(4)
@@ -155,6 +155,8 @@ def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> Floa
     new_lower, new_upper = np.percentile(goals @ axes.T, EXTENT_PERCENTILES, axis=0)
     scale = (new_upper - new_lower) / np.maximum(upper - lower, MIN_EXTENT_M)
     scale = np.where(upper - lower < MIN_EXTENT_M, 1, scale.clip(1 / MAX_STRETCH, MAX_STRETCH))
+    # How far down its sides are seen depends on the view: upward, only the top moves.
+    scale[2], lower[2], new_lower[2] = 1, upper[2], new_upper[2]
     shape[:3, :3] = axes.T @ np.diag(scale) @ axes
     shape[:3, 3] = axes.T @ ((new_lower + new_upper) / 2 - scale * (lower + upper) / 2)
     return shape
