@@ -67,7 +67,7 @@ class Photographs:
         a, b = ((points - mean) @ (1, 1j) for points, mean in ((source, from_mean), (target, to_mean)))
         factor = (weights * a.conj() * b).sum() / max((weights * abs(a) ** 2).sum(), 1e-9) if len(source) > 1 else 1.0
         moved = factor * complex(*(pixel - from_mean))
-        return to_mean + (moved.real, moved.imag)
+        return to_mean + np.array([moved.real, moved.imag])
 
 
 @dataclass(frozen=True, eq=False)

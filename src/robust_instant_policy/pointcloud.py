@@ -45,8 +45,8 @@ def steady(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 def table_plane(points: FloatArray, seed: int) -> FloatArray:
     """Plane ``(4,)`` (unit normal, upward; offset) of the table in ``points (N, 3)``.
 
-    Of the nearly horizontal planes with many points: the floor lies far under a table, the top of an object little above
-    it. So a higher plane replaces a lower one if it is more than `TALLEST_OBJECT_M` above it.
+    Of the nearly horizontal planes with many points: the floor lies far under a table, the top of an object little
+    above it. So a higher plane replaces a lower one if it is more than `TALLEST_OBJECT_M` above it.
     """
     rng = np.random.default_rng(seed)
     points = points[rng.choice(len(points), min(len(points), SAMPLED_POINTS), replace=False)]

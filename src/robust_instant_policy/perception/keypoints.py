@@ -14,7 +14,14 @@ from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.network import choose_network
-from robust_instant_policy.perception.objects import MIN_FITNESS, Registration, RigidObject, find_objects, register_all, without
+from robust_instant_policy.perception.objects import (
+    MIN_FITNESS,
+    Registration,
+    RigidObject,
+    find_objects,
+    register_all,
+    without,
+)
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
 from robust_instant_policy.perception.relevance import MIN_RELEVANCE, relevances, shares, still
 from robust_instant_policy.perception.selection import select_points
@@ -71,8 +78,8 @@ class KeypointExtractor:
     ) -> KeypointExtractor:
         """Choose keypoints and find them in ``observations``, the demonstrations' first images.
 
-        With the demonstrations' ``trajectories`` the keypoints lie on what the hand approaches, grasps or moves relative
-        to, otherwise on all objects. Raises `KeypointError` where the images have too little in common, or depth or
+        With the demonstrations' ``trajectories`` the keypoints lie on what the hand approaches, grasps or moves
+        relative to, otherwise on all objects. Raises `KeypointError` where the images have too little in common, or depth or
         foreground are missing.
         """
         if not observations:

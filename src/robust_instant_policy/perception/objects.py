@@ -29,7 +29,7 @@ MAX_TEMPLATE_CELLS = 80
 SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of other points of the object
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
-RIVAL_SCALE = 0.02  # of the score by which a motion is worse, for a weight of 1/e
+RIVAL_SCALE = 0.01  # of the score by which a motion is worse, for a weight of 1/e
 SAME_PLACE_M = 0.02
 MIN_FITNESS = 0.15  # of an object's registration in every demonstration
 MAX_OBJECTS = 30
@@ -38,8 +38,10 @@ SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object
 MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
 PART_TURNS = np.deg2rad(np.arange(-60.0, 90.0, 30.0))  # of a part against its object
 FAMILY_TURNS = np.zeros(1)  # of an object against itself with its parts
+MUCH_BETTER = 0.05  # of the score, by which an object's own registration overrules that with its parts
 MAX_PART_TRAVEL_M = 0.2
 TOUCH_M = 0.03
+MAX_SHARED_BY_PART = 0.6  # which touches its object
 MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one
 
 
@@ -161,7 +163,10 @@ def find_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
         family = (_template_of(home, np.concatenate([pieces[i] for i in members]), seed),)
         models[number] = replace(models[number], family=family)
     things = [_complete(models, found, number, views, seed) for number in range(len(models))]
-    shapes = [_shapes([thing.model for thing in things], [thing.registrations[i] for thing in things], view) for i, view in enumerate(views)]
+    shapes = [
+        _shapes([thing.model for thing in things], [thing.registrations[i] for thing in things], view)
+        for i, view in enumerate(views)
+    ]
     return [
         thing if not varies else _with_shapes(thing, [row[number] for row in shapes])
         for number, (thing, varies) in enumerate(zip(things, _vary(np.array(shapes)), strict=True))
@@ -197,7 +202,9 @@ def _vary(shapes: FloatArray) -> NDArray[np.bool_]:
 def _with_shapes(thing: RigidObject, shapes: Sequence[FloatArray]) -> RigidObject:
     """``thing``, which differs in size, with its ``shapes`` in all images."""
     pairs = zip(thing.registrations, shapes, strict=True)
-    return replace(thing, model=replace(thing.model, varies=True), registrations=tuple(replace(r, shape=s) for r, s in pairs))
+    return replace(
+        thing, model=replace(thing.model, varies=True), registrations=tuple(replace(r, shape=s) for r, s in pairs)
+    )
 
 
 def _shapes(models: Sequence[Model], found: Sequence[Registration], view: View) -> list[FloatArray]:
@@ -218,7 +225,10 @@ def without(things: Sequence[RigidObject], dropped: Sequence[bool]) -> list[Rigi
     """``things`` without those ``dropped``; their parts stand alone."""
     new_number = np.where(dropped, -1, np.cumsum(~np.array(dropped)) - 1)
     return [
-        replace(thing, model=replace(thing.model, parent=int(new_number[thing.model.parent]) if thing.model.parent >= 0 else -1))
+        replace(
+            thing,
+            model=replace(thing.model, parent=int(new_number[thing.model.parent]) if thing.model.parent >= 0 else -1),
+        )
         for thing, drop in zip(things, dropped, strict=True)
         if not drop
     ]
@@ -277,7 +287,9 @@ def _register_model(
         return register(model.templates, view, taken, found[model.parent].pose, PART_TURNS)
     if model.family:
         family = register(model.family, view, taken)
-        return register(model.templates, view, taken, family.pose, FAMILY_TURNS, alone=False)
+        found_in_family = register(model.templates, view, taken, family.pose, FAMILY_TURNS, alone=False)
+        found_alone = register(model.templates, view, taken, near)
+        return found_alone if found_alone.score > found_in_family.score + MUCH_BETTER else found_in_family
     return register(model.templates, view, taken, near)
 
 
@@ -294,7 +306,7 @@ def register_all(models: Sequence[Model], view: View) -> list[Registration]:
     taken = np.zeros(len(view.target), dtype=bool)
     settled: list[int] = []
     for i in sorted(range(len(models)), key=lambda i: -found[i].score):
-        if _shared(tree, taken, models[i], found[i]) > MAX_SHARED:
+        if _shared(tree, taken, models[i], found[i]) > (MAX_SHARED if models[i].parent < 0 else MAX_SHARED_BY_PART):
             again = _register_model(models[i], view, found, _explained(models, found, settled))
             options = [
                 replace(one, fitness=one.fitness * (1 - _shared(tree, taken, models[i], one)))
@@ -331,11 +343,9 @@ def _shared(tree: cKDTree, taken: NDArray[np.bool_], model: Model, found: Regist
     return float(taken[claimed].mean()) if len(claimed) else 0.0
 
 
-def _another_template(
-    view: View, found: Registration, templates: Sequence[Template], seed: int
-) -> list[Template]:
+def _another_template(view: View, found: Registration, templates: Sequence[Template], seed: int) -> list[Template]:
     """The object as ``view`` shows it, or nothing where it does not."""
-    to_reference = np.linalg.inv(found.motion)
+    to_reference: FloatArray = np.linalg.inv(found.motion)
     known = templates[found.template].xyzrgb
     points = transform_points(to_reference, view.target[:, :3])
     same = cKDTree(known[:, :3]).query(points)[0] < SAME_OBJECT_M

@@ -26,7 +26,9 @@ MIN_DISTANCE_M = 0.004  # mean; less is the noise of the depth
 BoolArray = NDArray[np.bool_]
 
 
-def candidate_parts(home: View, piece: IntArray, views: Sequence[View], motions: Sequence[FloatArray]) -> list[BoolArray]:
+def candidate_parts(
+    home: View, piece: IntArray, views: Sequence[View], motions: Sequence[FloatArray]
+) -> list[BoolArray]:
     """Parts ``(N,)`` of a ``piece (N,)`` of the image ``home`` that may move against the rest: those that are thin, and
     those that the ``motions`` of the whole into each of ``views`` leave off the surfaces there.
     """
@@ -56,9 +58,7 @@ def _connected(home: View, piece: IntArray, which: BoolArray) -> list[BoolArray]
     return parts
 
 
-def gain(
-    points: FloatArray, views: Sequence[View], whole: Sequence[FloatArray], own: Sequence[FloatArray]
-) -> float:
+def gain(points: FloatArray, views: Sequence[View], whole: Sequence[FloatArray], own: Sequence[FloatArray]) -> float:
     """Share by which the distances of a part's ``points (N, 3)`` from the surfaces in ``views`` become smaller with its
     ``own`` motions than with those of the ``whole``; 0 where those explain it.
     """

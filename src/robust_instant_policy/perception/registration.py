@@ -13,9 +13,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from robust_instant_policy.geometry import FloatArray, fit_upright, invert_pose, rotations_about_vertical, transform_points
-from robust_instant_policy.perception.descriptors import Float32Array
+from robust_instant_policy.geometry import (
+    FloatArray,
+    fit_upright,
+    invert_pose,
+    rotations_about_vertical,
+    transform_points,
+)
+from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 
 # Votes.
 ANGLE_BINS = 24
@@ -41,7 +48,9 @@ SMALL_TURNS = np.deg2rad(np.arange(-20.0, 25.0, 5.0))  # the middle one is none
 MAX_SYMMETRY_LOSS = 0.04  # of the fitness, by small turns, for a rotationally symmetric object
 SIMILARITY_SCALE = 0.01  # of the softmax over small turns
 LARGE_TURNS = np.deg2rad(np.arange(30.0, 360.0, 30.0))
-SLIDES_M = 0.025 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+SLIDES_M = 0.025 * np.array(
+    [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]
+)
 RIVAL_REACH_M = (0.02, 0.015)
 
 # Shape.
@@ -143,8 +152,9 @@ def find_rivals(motion: FloatArray, source: Float32Array, target: Float32Array, 
 
 
 def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
-    """How an object of the same kind differs in size: an affine map ``(4, 4)`` of its own frame, before ``motion``, that
-    stretches ``source (N, 3)`` along its horizontal axes, and lifts it, to the extent of the points ``goals (M, 3)``.
+    """How an object of the same kind differs in size: an affine map ``(4, 4)`` of its own frame, before ``motion``.
+
+    It stretches ``source (N, 3)`` along its horizontal axes, and lifts it, to the extent of the points ``goals (M, 3)``.
     """
     goals = transform_points(invert_pose(motion), goals)
     shape = np.eye(4)

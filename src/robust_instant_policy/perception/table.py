@@ -22,8 +22,8 @@ MAX_ABOVE_M = 0.8  # of what stands on a table
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """``plane (4,)``: unit normal, upward, and offset; ``noise``: standard deviation of its points, metres; ``on (N, 2)``
-    and ``off (M, 2)``: places in the plane where rays meet the table and where they pass beside it, metres.
+    """``plane (4,)``: unit normal, upward, and offset; ``noise``: standard deviation of its points, metres;
+    ``on (N, 2)`` and ``off (M, 2)``: places in the plane where rays meet the table and where they pass beside it, metres.
     """
 
     plane: FloatArray
@@ -45,7 +45,9 @@ class Table:
         camera_height = camera @ plane[:3] + plane[3]
         share = (camera_height / (camera_height - heights[below]))[:, None]
         crossings = camera + share * (points[below] - camera)
-        return cls(plane, noise, (points[np.abs(heights) < MIN_HEIGHT_M] @ level.T)[:, :2], (crossings @ level.T)[:, :2])
+        return cls(
+            plane, noise, (points[np.abs(heights) < MIN_HEIGHT_M] @ level.T)[:, :2], (crossings @ level.T)[:, :2]
+        )
 
     def heights(self, points: FloatArray) -> FloatArray:
         """Heights ``(N,)`` of ``points (N, 3)`` above the table, metres."""
@@ -61,7 +63,9 @@ class Table:
         if not len(self.off) or not len(self.on):
             return np.zeros(len(points), dtype=bool)
         places = (points @ levelling(self.plane)[:3, :3].T)[:, :2]
-        to_table, to_nothing = (cKDTree(tested[:: max(1, len(tested) // 4000)]).query(places)[0] for tested in (self.on, self.off))
+        to_table, to_nothing = (
+            cKDTree(tested[:: max(1, len(tested) // 4000)]).query(places)[0] for tested in (self.on, self.off)
+        )
         return to_table > to_nothing + EDGE_MARGIN_M
 
 

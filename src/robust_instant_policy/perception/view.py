@@ -66,8 +66,8 @@ REASONS = {
 class View:
     """An ``observation``, its ``descriptors``, its ``depth (H, W)`` in metres, and its foreground.
 
-    The world of a view is level: ``to_world (4, 4)`` maps it to the world of the given camera pose, from which it differs
-    where that is tilted. Foreground: ``points (N, 3)`` in metres; the same as ``xyzrgb (N, 6)`` in metres, colours in
+    The world of a view is level: ``to_world (4, 4)`` maps it to the world of the given camera pose, from which it
+    differs where that is tilted. Foreground: ``points (N, 3)`` in metres; the same as ``xyzrgb (N, 6)`` in metres, colours in
     units of `COLOUR_SCALE_M`; ``pieces``, the points' numbers by connected piece; ``target (M, 6)``, a sample of
     ``xyzrgb`` to which objects are registered; ``cells (C,)`` of the descriptor map: first those with foreground,
     whose mean points are ``cell_points (F, 3)``, then their neighbours. ``labels (h, w)``, subsampled by ``stride``: a
@@ -95,8 +95,8 @@ def make_view(
     """Describe and segment an image.
 
     A point is foreground by its height above the table, or, when flat, by the network's saliency and a colour that
-    differs from the table's. What is below or beside the table, outside ``workspace (2, 3)`` (metres, world; its lower z
-    is ignored), or reaches in over the border is not. Raises `KeypointError` for intrinsics of another resolution, and
+    differs from the table's. What is below or beside the table, outside ``workspace (2, 3)`` (metres, world; its lower
+    z is ignored), or reaches in over the border is not. Raises `KeypointError` for intrinsics of another resolution, and
     for too few depth readings or foreground points.
     """
     _check_resolution(observation)
@@ -153,7 +153,19 @@ def make_view(
     cells = np.concatenate([cells, neighbours])
     notes = tuple(line for line in (note, small) if line)
     return View(
-        observation, descriptors, depth, to_world, points, xyzrgb, pieces, target, cells, cell_points, labels, stride, notes
+        observation,
+        descriptors,
+        depth,
+        to_world,
+        points,
+        xyzrgb,
+        pieces,
+        target,
+        cells,
+        cell_points,
+        labels,
+        stride,
+        notes,
     )
 
 
@@ -197,7 +209,9 @@ def connected_pieces(points: FloatArray, gap: float) -> IntArray:
     """Number ``(N,)`` of the piece of each of ``points (N, 3)``: chains of points less than ``gap`` apart."""
     if not len(points):
         return np.zeros(0, dtype=np.intp)
-    _, voxel, counts = np.unique(np.floor(points / (gap / 3)).astype(int), axis=0, return_inverse=True, return_counts=True)
+    _, voxel, counts = np.unique(
+        np.floor(points / (gap / 3)).astype(int), axis=0, return_inverse=True, return_counts=True
+    )
     voxel = voxel.reshape(-1)
     centres = np.stack([np.bincount(voxel, axis) for axis in points.T], axis=1) / counts[:, None]
     a, b = cKDTree(centres).query_pairs(gap, output_type="ndarray").T
@@ -255,7 +269,9 @@ def _leave_out(label: IntArray, heights: FloatArray, pixels: IntArray) -> str:
             number += 1
     if not small:
         return ""
-    return f"too small for keypoints: what is at pixel {', '.join(small[:MAX_TOLD])}; take larger or nearer images of it"
+    return (
+        f"too small for keypoints: what is at pixel {', '.join(small[:MAX_TOLD])}; take larger or nearer images of it"
+    )
 
 
 @dataclass(frozen=True, eq=False)
