@@ -1,7 +1,7 @@
 """Success, training time and planning time of the baselines, from runs of `rip eval`.
 
 rip eval --methods kat-dp --demos 200 --episodes 20 --out runs/proof    (and the like)
-python benchmarks/baselines.py results/paper runs/proof --checkpoints checkpoints --table docs/tables/baselines.md
+python benchmarks/baselines.py results/adaptive runs/proof --checkpoints checkpoints --table docs/tables/baselines.md
 
 Training times are stored in `results/baselines/training.json`, so that checkpoints can be deleted.
 """

@@ -112,7 +112,8 @@ def _objects(rng: np.random.Generator) -> FloatArray:
     return np.column_stack([rng.uniform([0.25, -0.25], [0.55, 0.25], (2, 2)), rng.uniform(0.01, 0.05, 2)])
 
 
-def _noisy(rng: np.random.Generator, actions: FloatArray, level: float) -> FloatArray:
+def noisy(rng: np.random.Generator, actions: FloatArray, level: float) -> FloatArray:
+    """``actions (T, 10)`` as a candidate has them: noise, whole millimetres, gripper changes a step off."""
     count = len(actions)
     noisy = actions.copy()
     points = actions[:, :9].reshape(count, 3, 3)
@@ -205,7 +206,7 @@ def draw_modes(seed: int, style: str, sizes: tuple[int, ...]) -> Scene:
         truths = [common]
     modes = rng.permutation(np.repeat(np.arange(len(sizes)), sizes))
     times = np.linspace(0.0, 1.0, STEPS)
-    candidates = [_noisy(rng, truths[mode](times), level) for mode in modes]
+    candidates = [noisy(rng, truths[mode](times), level) for mode in modes]
     return Scene(truths[0], candidates, np.zeros(len(modes), dtype=bool), modes, tuple(truths))
 
 
@@ -240,7 +241,7 @@ def draw_scene(seed: int, style: str, num_candidates: int, num_hallucinated: int
             moved = np.linalg.norm((actions - right)[:, :9].reshape(-1, 3, 3), axis=-1)
             if moved.max() > NOTICEABLE_M:
                 break
-        candidates.append(_noisy(rng, actions, level))
+        candidates.append(noisy(rng, actions, level))
     return Scene(truth, candidates, hallucinated, np.zeros(num_candidates, dtype=np.intp), (truth,))
 
 

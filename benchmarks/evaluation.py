@@ -39,7 +39,7 @@ from robust_instant_policy.evaluation.work import SceneWork
 from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.llm import model_name
 
-METHODS = ("rip", "rip-gauss", "kat")
+METHODS = ("rip", "rip-gauss", "mean", "kat")
 PARTS = ("planning", "building scenes", "rendering", "physics")
 
 

@@ -134,6 +134,23 @@ def bgr(o: Observation) -> Observation:
     return replace(o, rgb=o.rgb[..., ::-1])
 
 
+def depth_stripe(o: Observation) -> Observation:
+    """A band of rows reads 30% too near, across the whole image."""
+    depth, height = o.depth.copy(), o.depth.shape[0]
+    depth[int(0.4 * height) : int(0.55 * height)] *= np.float32(0.7)
+    return replace(o, depth=depth)
+
+
+def cropped(share: float) -> Callable[[Observation], Observation]:
+    """The image cut on the left and at the top, with the intrinsics of the whole one."""
+
+    def apply(o: Observation) -> Observation:
+        by = round(share * o.rgb.shape[1])
+        return replace(o, rgb=o.rgb[by:, by:], depth=o.depth[by:, by:])
+
+    return apply
+
+
 def no_depth(o: Observation) -> Observation:
     return replace(o, depth=np.zeros_like(o.depth))
 
@@ -241,6 +258,35 @@ def flange(triplets: FloatArray) -> FloatArray:
     middle = triplets[..., 1:, :].mean(axis=-2)
     approach = middle - triplets[..., 0, :]
     return triplets - 0.15 * (approach / np.linalg.norm(approach, axis=-1, keepdims=True))[..., None, :]
+
+
+def reversed_in_time(d: Demonstration) -> Demonstration:
+    return replace(d, trajectory=Trajectory.from_actions(d.trajectory.actions[::-1]))
+
+
+def arms_exchanged(own: FloatArray) -> FloatArray:
+    return own[:, ::-1].copy()
+
+
+def rotations(change: Callable[[Rotation], Rotation]) -> Callable[[FloatArray], FloatArray]:
+    """The gripper turned about its tool point by a mistake in reading its rotation."""
+
+    def apply(triplets: FloatArray) -> FloatArray:
+        triangle = GripperTriangle.from_triplets(triplets)
+        poses = triangle.poses(triplets)
+        wrong = change(Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3))).as_matrix()
+        poses[..., :3, :3] = wrong.reshape(poses[..., :3, :3].shape)
+        return triangle.triplets(poses)
+
+    return apply
+
+
+def radians_as_degrees(own: Rotation) -> Rotation:
+    return Rotation.from_euler("xyz", own.as_euler("xyz"), degrees=True)
+
+
+def degrees_as_radians(own: Rotation) -> Rotation:
+    return Rotation.from_euler("xyz", own.as_euler("xyz", degrees=True))
 
 
 def shuffled(ds: Sequence[Demonstration]) -> Demonstrations:
@@ -449,6 +495,11 @@ def _image_faults() -> dict[str, tuple[Callable[[Observation], Observation], tup
         "camera-5deg-roll": (turned("x", 5), ("camera", "table")),
         "camera-5deg-yaw": (turned("z", 5), ("camera",)),
         "camera-180deg-yaw": (turned("z", 180), ("camera",)),
+        "camera-3cm-low": (moved(z=-0.03), ("camera", "table", "above")),
+        "camera-3cm-x": (moved(x=0.03), ("camera", "displaced")),
+        "cropped-3%": (cropped(0.03), ("crop", "principal point")),
+        "cropped-10%": (cropped(0.1), ("crop", "principal point")),
+        "depth-stripe": (depth_stripe, ("rows",)),
         "no-depth": (no_depth, ("depth",)),
         "flat-depth": (flat_depth, ("depth", "raised")),
         "black": (black, ("colour", "dark", "black")),
@@ -480,6 +531,13 @@ def _faults() -> dict[str, Fault]:
     add("quaternion-order:demos", ("quaternion",), demonstrations=points(quaternion_order))
     add("tool-along-x:demos", ("tool", "gripper"), demonstrations=points(tool_along_x))
     add("flange:demos", ("surface", "tool", "camera"), demonstrations=points(flange))
+    add("paths-3cm-x:demos", ("displaced",), demonstrations=points(lambda p: p + np.array([0.03, 0, 0])))
+    add("paths-3cm-y:demos", ("displaced",), demonstrations=points(lambda p: p + np.array([0, 0.03, 0])))
+    add("paths-3cm-up:demos", ("above", "surface"), demonstrations=points(lambda p: p + np.array([0, 0, 0.03])))
+    add("reversed:demos", ("backwards",), demonstrations=lambda ds: [reversed_in_time(d) for d in ds])
+    add("arms-exchanged:demos", ("which arm",), demonstrations=actions(arms_exchanged))
+    add("radians-as-degrees:demos", ("degrees",), demonstrations=points(rotations(radians_as_degrees)))
+    add("degrees-as-radians:demos", ("radians", "rotation"), demonstrations=points(rotations(degrees_as_radians)))
     add("axes-swapped:demos", ("axes", "x and y"), demonstrations=points(lambda p: p[..., [1, 0, 2]]))
     add("base-frame:demos", ("surface", "camera"), demonstrations=points(lambda p: p + np.array([0.5, 0, 0])))
     add("state-255:demos", ("0 or 1",), demonstrations=states(lambda g: g * 255))

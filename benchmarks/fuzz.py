@@ -15,14 +15,12 @@ import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
-from hypothesis import HealthCheck, given, settings
-from hypothesis import seed as seeded
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from tests.fuzz_targets import CORPUS, TARGETS, Case, Target, run  # noqa: E402
+from tests.fuzz_targets import CORPUS, TARGETS, Case, Target, fuzz, run  # noqa: E402
 
 if importlib.util.find_spec("tests.fuzz_targets_llm"):
     from tests.fuzz_targets_llm import SERVER_REPLIES, check_server_reply
@@ -51,7 +49,7 @@ def main() -> int:
     tallies = {}
     with Progress(*columns) as progress:
         for name in options.targets:
-            tallies[name] = fuzz(TARGETS[name], options.cases, options.seed, progress)
+            tallies[name] = count(TARGETS[name], options.cases, options.seed, progress)
     text = table(tallies, options.seed)
     print(text)
     if set(tallies) == set(TARGETS):
@@ -59,20 +57,11 @@ def main() -> int:
     return 1 if any(tally.failed for tally in tallies.values()) else 0
 
 
-def fuzz(target: Target, cases: int, seed: int, progress: Progress) -> Tally:
+def count(target: Target, cases: int, seed: int, progress: Progress) -> Tally:
     """Run a target; a failure is printed with its seed, and kept."""
     tally = Tally()
     bar = progress.add_task(target.name, total=cases)
 
-    @seeded(seed)
-    @settings(
-        max_examples=cases,
-        deadline=None,
-        database=None,
-        report_multiple_bugs=False,
-        suppress_health_check=list(HealthCheck),
-    )
-    @given(case=target.cases)
     def check(case: Case) -> None:
         try:
             outcome = run(target, case)
@@ -85,7 +74,7 @@ def fuzz(target: Target, cases: int, seed: int, progress: Progress) -> Tally:
         progress.update(bar, completed=min(tally.cases, cases))
 
     try:
-        check()
+        fuzz(target, cases, seed, check)
     except Exception:  # of any kind: that is what is looked for
         case = tally.failed
         if case is None:

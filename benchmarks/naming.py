@@ -1,6 +1,6 @@
 """Accuracy of the diagnosis: share of flagged candidates among those that fail, and succeed, when executed alone.
 
-    python benchmarks/naming.py --run results/paper --out docs/tables/naming.md
+    python benchmarks/naming.py --run results/adaptive --out docs/tables/naming.md
 
 The run is one of `rip eval --suite table1` with the methods `rip` and `kat`, its samples beside its rows: `kat`
 executes every candidate alone. Only scenes in which `rip` succeeds count: with wrong keypoints all candidates fail

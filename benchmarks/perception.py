@@ -24,6 +24,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,13 @@ from PIL import Image, ImageDraw
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.perception import PAPER_REAL, PAPER_SIMULATION, KeypointExtractor, measure
+from robust_instant_policy.perception import (
+    CORRESPONDENCES,
+    PAPER_REAL,
+    PAPER_SIMULATION,
+    KeypointExtractor,
+    measure,
+)
 from robust_instant_policy.perception.accuracy import Accuracy
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.efficientnet import load_network
@@ -77,25 +84,28 @@ class KnownScenes:
         task.close()
         return cls(images, truths, task.workspace)
 
-    def accuracy(self, features: str | DescriptorNetwork, camera: Camera | None) -> Accuracy:
+    def accuracy(
+        self, features: str | DescriptorNetwork, camera: Camera | None, correspondence: str = "registration"
+    ) -> Accuracy:
         """Accuracy in the new scenes, with all images through ``camera``."""
         shown, new = slice(None, DEMONSTRATIONS), slice(DEMONSTRATIONS, None)
         images, truths = self.images, self.truths
         seen = images[shown] if camera is None else [camera(o, 1000 + i) for i, o in enumerate(images[shown])]
-        extractor = KeypointExtractor(features=features, workspace=self.workspace).fit(seen)
+        extractor = KeypointExtractor(features=features, workspace=self.workspace, correspondence=correspondence)
+        extractor.fit(seen)
         return measure(extractor, images[shown], truths[shown], images[new], truths[new], camera)
 
 
 def accuracy(tasks: list[str]) -> None:
     rows = [
-        "| task | camera | keypoints on moving objects | median error | 90th percentile |",
-        "| --- | --- | --- | --- | --- |",
+        "| task | camera | correspondence | keypoints on moving objects | median error | 90th percentile |",
+        "| --- | --- | --- | --- | --- | --- |",
     ]
     for name in tasks:
         scenes = KnownScenes.of(name)
-        for label, camera in CAMERAS.items():
-            found = scenes.accuracy("efficientnet", camera)
-            row = f"| {name} | {label} | {found.on_object} of {len(found.part_of)} "
+        for (label, camera), correspondence in product(CAMERAS.items(), CORRESPONDENCES):
+            found = scenes.accuracy("efficientnet", camera, correspondence)
+            row = f"| {name} | {label} | {correspondence} | {found.on_object} of {len(found.part_of)} "
             rows.append(row + f"| {found.median * 1e3:.1f} mm | {found.worst_tenth * 1e3:.1f} mm |")
             print(rows[-1], flush=True)
     (TABLES / "perception_accuracy.md").write_text("\n".join(rows) + "\n")

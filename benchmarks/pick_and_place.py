@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
-from robust_instant_policy.geometry import FloatArray, GripperTriangle, interpolate_poses, make_pose
+from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pose
 from robust_instant_policy.trajectory import Trajectory, downsample
 
 TRIANGLE = GripperTriangle(length=0.10, opening=0.08)
@@ -82,9 +83,17 @@ def _played(ways: list[tuple[FloatArray, int]], rng: np.random.Generator) -> Tra
     poses, states = [ways[0][0][None]], [np.array([ways[0][1]])]
     for (start, _), (stop, state) in pairwise(ways):
         count = max(2, round(np.linalg.norm(stop[:3, 3] - start[:3, 3]) / 0.005 * rng.uniform(0.8, 1.25)))
-        poses.append(interpolate_poses([0, 1], np.stack([start, stop]), np.arange(1, count + 1) / count))
+        poses.append(between(start, stop, np.arange(1, count + 1) / count))
         states.append(np.full(count, state))
     return Trajectory.from_poses(np.concatenate(poses), np.concatenate(states), TRIANGLE)
+
+
+def between(start: FloatArray, stop: FloatArray, shares: FloatArray) -> FloatArray:
+    """Poses ``(N, 4, 4)`` at ``shares (N,)`` of a straight way that turns evenly."""
+    poses = np.tile(np.eye(4), (len(shares), 1, 1))
+    poses[:, :3, :3] = Slerp([0, 1], Rotation.from_matrix([start[:3, :3], stop[:3, :3]]))(shares).as_matrix()
+    poses[:, :3, 3] = start[:3, 3] + shares[:, None] * (stop[:3, 3] - start[:3, 3])
+    return poses
 
 
 def _turned(place: FloatArray, angle: float) -> FloatArray:

@@ -28,7 +28,7 @@ from robust_instant_policy.context import Frames, Layout, Order, Prompt, write_p
 from robust_instant_policy.errors import ModelError
 from robust_instant_policy.llm import LanguageModel, Listener, Sampling, connect
 from robust_instant_policy.query import Query
-from robust_instant_policy.regression import DEFAULT_DOF, robust_gripper_trajectory
+from robust_instant_policy.regression import robust_gripper_trajectory
 from robust_instant_policy.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[1]
@@ -63,7 +63,7 @@ class Outcome:
     scene: int
     cold: bool
     single: tuple[float, ...]
-    gaussian: float
+    mean: float
     robust: float
     refused: int
     answers: int
@@ -111,8 +111,8 @@ class Measurement:
             scene=number,
             cold=self._cold,
             single=(*single, *[float("inf")] * (NUM_SAMPLES - len(single))),
-            gaussian=agreed_error(candidates, scene, float("inf"), self._prompt.curvature),
-            robust=agreed_error(candidates, scene, DEFAULT_DOF, self._prompt.curvature),
+            mean=agreed_error(candidates, scene, "mean", self._prompt.curvature),
+            robust=agreed_error(candidates, scene, "em", self._prompt.curvature),
             refused=counts[False],
             answers=counts.total(),
             tokens=sum(one.prompt_tokens - one.cached_tokens + one.completion_tokens for one in every),
@@ -142,10 +142,11 @@ def fitted(demos: Sequence[Scene], frames: Frames, layout: Layout, order: Order)
     return write_prompt(keypoints, [demo.trajectory for demo in demos], frames, layout, order)
 
 
-def agreed_error(candidates: Sequence[Trajectory], scene: Scene, dof: float, curvature: np.ndarray) -> float:
+def agreed_error(candidates: Sequence[Trajectory], scene: Scene, estimator: str, curvature: np.ndarray) -> float:
     if len(candidates) < MIN_CANDIDATES:
         return float("inf")
-    fit = robust_gripper_trajectory([candidate.actions for candidate in candidates], dof=dof, curvature=curvature)
+    actions = [candidate.actions for candidate in candidates]
+    fit = robust_gripper_trajectory(actions, estimator=estimator, curvature=curvature)
     return key_error(Trajectory.from_actions(fit.actions), scene.trajectory)
 
 
@@ -209,7 +210,7 @@ COLUMNS = (
     "temperature",
     "scenes",
     "single sample",
-    "Gaussian mean",
+    "mean",
     "Student's t",
     "unparsable",
     "tokens a plan, first / later",
@@ -238,7 +239,7 @@ def as_cells(row: Row, plans: Sequence[Outcome]) -> list[str]:
         f"{row.temperature:g}",
         str(len(plans)),
         _errors([error for plan in plans for error in plan.single]),
-        _errors([plan.gaussian for plan in plans]),
+        _errors([plan.mean for plan in plans]),
         _errors([plan.robust for plan in plans]),
         f"{sum(plan.refused for plan in plans) / max(sum(plan.answers for plan in plans), 1):.0%}",
         both(".0f", "tokens"),

@@ -8,12 +8,12 @@ import numpy as np
 from contaminated_trajectories import draw_scene
 
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.regression import StudentTRegression
+from robust_instant_policy.regression import StudentTNumbers, StudentTRegression
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "regression.svg"
 WIDTH, HEIGHT, STRIP, MARGIN = 640.0, 260.0, 70.0, 36.0
 COLUMN = 0  # gripper point, x
-COLOURS = {"clean": "#9aa5b1", "hallucinated": "#e5484d", "Gaussian": "#f0a020", "robust": "#1f6feb"}
+COLOURS = {"clean": "#9aa5b1", "hallucinated": "#e5484d", "mean": "#f0a020", "robust": "#1f6feb"}
 
 
 def line(x: FloatArray, y: FloatArray, colour: str, width: float, dash: str = "") -> str:
@@ -32,7 +32,7 @@ def main() -> None:
     points = [candidate[:, :9] for candidate in scene.candidates]
     times = scene.times
     fit = StudentTRegression(groups=np.zeros(9)).fit(points)
-    gaussian = StudentTRegression(dof=np.inf).fit(points).mean(times)
+    mean = StudentTNumbers(dof=np.inf).fit(points).mean(times)
     values = np.concatenate([candidate[:, COLUMN] for candidate in points])
     low, high = values.min(), values.max()
 
@@ -48,7 +48,7 @@ def main() -> None:
         clock = np.linspace(0, 1, len(candidate))
         colour = COLOURS["hallucinated" if wrong else "clean"]
         shapes.append(line(across(clock), up(candidate[:, COLUMN], bottom, HEIGHT - 50, low, high), colour, 1.2))
-    for curve, name, dash in ((gaussian, "Gaussian", "5 3"), (fit.mean(times), "robust", "")):
+    for curve, name, dash in ((mean, "mean", "5 3"), (fit.mean(times), "robust", "")):
         shapes.append(
             line(across(times), up(curve[:, COLUMN], bottom, HEIGHT - 50, low, high), COLOURS[name], 2.2, dash)
         )
@@ -60,7 +60,7 @@ def main() -> None:
     names = {
         "clean": "candidates",
         "hallucinated": "hallucinated",
-        "Gaussian": "mean (ν = ∞)",
+        "mean": "mean",
         "robust": "robust (ν = 1.5)",
     }
     shapes += [label(MARGIN + 130 * k, 18, text, COLOURS[name]) for k, (name, text) in enumerate(names.items())]

@@ -64,13 +64,21 @@ def measure(task: str, folder: Path, seed: int, out: Path) -> None:
 
 
 def table(folder: Path) -> str:
-    """Markdown: for each fault the number of tasks with each of `OUTCOMES`."""
+    """Markdown: the number of tasks with each of `OUTCOMES` of each fault, of those that are not named in all tasks."""
     measured = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
     lines = [f"| fault | {' | '.join(OUTCOMES)} |", "| --- " * (len(OUTCOMES) + 1) + "|"]
+    named = 0
     for name in FAULTS:
         counts = Counter(rows[name][0] for rows in measured if name in rows)
-        lines.append(f"| {name} | {' | '.join(str(counts[one] or '') for one in OUTCOMES)} |")
-    return "\n".join(lines) + f"\n\nNumber of tasks, of {len(measured)}.\n"
+        if counts[OUTCOMES[0]] == len(measured):
+            named += 1
+        elif counts:
+            lines.append(f"| {name} | {' | '.join(str(counts[one] or '') for one in OUTCOMES)} |")
+    others = len(lines) - 2
+    return (
+        f"{named} of {named + others} faults are refused and named in all of {len(measured)} tasks. The others, by "
+        f"number of tasks:\n\n{chr(10).join(lines)}\n"
+    )
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 """Success of the demonstrators and of replayed recordings, and the speed of the simulation.
 
     python benchmarks/simulation.py [--attempts 100] [--tasks push-cube …] [--out results/simulation.md]
+    python benchmarks/simulation.py --level hard --downsampling masked --no-speed --out results/simulation-hard.md
 
 Replays execute the recording, downsampled to about 30 steps, in its scene. Measurements are stored beside ``--out`` as
 .json; an interrupted run continues.
@@ -19,11 +20,12 @@ from pathlib import Path
 import numpy as np
 
 from robust_instant_policy.errors import UnreachableError
-from robust_instant_policy.tasks import TASK_NAMES, make_task
+from robust_instant_policy.policies.settings import DOWNSAMPLING
+from robust_instant_policy.tasks import TASK_NAMES, UNSEEN_TASKS, make_task
+from robust_instant_policy.tasks.level import LEVELS, PAPER
 from robust_instant_policy.tasks.task import Task
 from robust_instant_policy.trajectory import Trajectory, downsample
 
-UNSEEN = ("close-cabinet", "turn-faucet", "aloha-sweep", "aloha-pick-place")
 TIMED_EPISODES = 5
 
 
@@ -55,8 +57,8 @@ def replays(task: Task, seed: int, trajectory: Trajectory) -> bool:
         return False
 
 
-def measure_quality(task: Task, objects: str, attempts: int) -> Quality:
-    seconds, replayed = [], {"masked": 0, "uniform": 0}
+def measure_quality(task: Task, objects: str, attempts: int, downsampling: list[str]) -> Quality:
+    seconds, replayed = [], dict.fromkeys(downsampling, 0)
     for seed in range(attempts):
         attempt = task.demonstrate(seed)
         if attempt.success:
@@ -100,10 +102,18 @@ def page(qualities: list[Quality], speeds: list[Speed]) -> str:
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for one in qualities:
-        masked, uniform = (f"{one.replayed[method]}/{one.successes}" for method in ("masked", "uniform"))
+        masked, uniform = (
+            f"{one.replayed[method]}/{one.successes}" if method in one.replayed else "–" for method in DOWNSAMPLING
+        )
         succeeds = f"{one.successes}/{one.attempts}"
         lines.append(f"| {one.task} | {one.objects} | {succeeds} | {one.seconds:.1f} s | {masked} | {uniform} |")
-    lines += [
+    if speeds:
+        lines += speed_table(speeds)
+    return "\n".join(lines) + "\n"
+
+
+def speed_table(speeds: list[Speed]) -> list[str]:
+    lines = [
         "",
         "| task | reset with image | simulated s per s | with video | recorded episodes/h | with images |",
         "| --- | --- | --- | --- | --- | --- |",
@@ -118,31 +128,35 @@ def page(qualities: list[Quality], speeds: list[Speed]) -> str:
         "",
         f"{os.cpu_count()} cores, {platform.machine()}, no GPU; load of the machine while measuring {load:.1f}.",
     ]
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--attempts", type=int, default=100)
     parser.add_argument("--tasks", nargs="+", choices=TASK_NAMES, default=TASK_NAMES)
+    parser.add_argument("--level", choices=tuple(LEVELS), default=PAPER.name)
+    parser.add_argument("--downsampling", nargs="+", choices=DOWNSAMPLING, default=DOWNSAMPLING)
+    parser.add_argument("--no-speed", action="store_true", help="measure successes only")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     kept = None if options.out is None else options.out.with_suffix(".json")
     measured = json.loads(kept.read_text()) if kept is not None and kept.exists() else {}
-    wanted = [(n, o) for n in options.tasks for o in (("seen", "unseen") if n in UNSEEN else ("seen",))]
+    wanted = [(n, o) for n in options.tasks for o in (("seen", "unseen") if n in UNSEEN_TASKS else ("seen",))]
     for name, objects in wanted:
-        key = f"{name} {objects} {options.attempts}"
+        key = f"{name} {objects} {options.attempts} {options.level}"
         if key in measured:
             continue
-        task = make_task(name, objects)
-        speed = asdict(measure_speed(task)) if objects == "seen" else None
-        measured[key] = {"quality": asdict(measure_quality(task, objects, options.attempts)), "speed": speed}
+        task = make_task(name, objects, level=options.level)
+        speed = asdict(measure_speed(task)) if objects == "seen" and not options.no_speed else None
+        quality = measure_quality(task, objects, options.attempts, options.downsampling)
+        measured[key] = {"quality": asdict(quality), "speed": speed}
         task.close()
         print(key, measured[key], flush=True)
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
             kept.write_text(json.dumps(measured, indent=1) + "\n")
-    rows = [measured[f"{name} {objects} {options.attempts}"] for name, objects in wanted]
+    rows = [measured[f"{name} {objects} {options.attempts} {options.level}"] for name, objects in wanted]
     text = page([Quality(**row["quality"]) for row in rows], [Speed(**row["speed"]) for row in rows if row["speed"]])
     print(text)
     if options.out:

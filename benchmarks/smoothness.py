@@ -1,7 +1,7 @@
-"""Largest second differences of demonstrations, single samples, their Gaussian mean, and robust trajectories with and
+"""Largest second differences of demonstrations, single samples, their mean, and robust trajectories with and
 without the curvature of the demonstrations.
 
-    python benchmarks/smoothness.py --samples results/paper/samples.sqlite --out docs/tables/smoothness.md
+    python benchmarks/smoothness.py --samples results/adaptive/samples.sqlite --out docs/tables/smoothness.md
 
 The samples are those that `rip eval --suite table1` stored; no model is needed. Second differences are those of any of
 the gripper's points over three successive steps.
@@ -18,11 +18,10 @@ from stored_proposals import NUM_DEMOS, arguments, proposals
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import Context, LocatedScene, Proposal, Settings, aggregate
-from robust_instant_policy.regression import DEFAULT_DOF
 from robust_instant_policy.reporting.tables import Table
 from robust_instant_policy.trajectory import Trajectory
 
-COLUMNS = ("demonstrations", "a single sample", "Gaussian mean", "robust, curvature unknown", "robust")
+COLUMNS = ("demonstrations", "a single sample", "mean", "robust, curvature unknown", "robust")
 
 
 def sharpest_turn(trajectory: Trajectory) -> float:
@@ -34,11 +33,11 @@ def sharpest_turn(trajectory: Trajectory) -> float:
 def turns(context: Context, scene: LocatedScene, proposal: Proposal) -> tuple[list[float], float]:
     """Largest second differences for all but the first of `COLUMNS`, and the shift of key steps by known curvature."""
     unknown = replace(context, prompt=replace(context.prompt, curvature=None))
-    gaussian, free, robust = (
-        aggregate(known, scene, proposal, Settings(dof=dof)).trajectory
-        for known, dof in ((context, np.inf), (unknown, DEFAULT_DOF), (context, DEFAULT_DOF))
+    mean, free, robust = (
+        aggregate(known, scene, proposal, Settings(estimator=estimator)).trajectory
+        for known, estimator in ((context, "mean"), (unknown, "em"), (context, "em"))
     )
-    paths = (proposal.candidates[0], gaussian, free, robust)
+    paths = (proposal.candidates[0], mean, free, robust)
     return [sharpest_turn(path) for path in paths], key_error(robust, free)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 import robust_instant_policy as rip
-from robust_instant_policy.evaluation.scenes import FIRST_TEST_SEED
+from robust_instant_policy.evaluation.scenes import SPLITS
 from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
 from robust_instant_policy.llm import ReplayedModel, SampleStore, model_name
 from robust_instant_policy.policies import (
@@ -36,7 +36,7 @@ def proposals(
     model = ReplayedModel(SampleStore(samples), model_name(llm))
     settings = Settings(num_queries=NUM_QUERIES).changed(workspace=task.workspace)
     context = build_context(demonstrations, settings)
-    for seed in tqdm(range(FIRST_TEST_SEED, FIRST_TEST_SEED + scenes), desc=task_name):
+    for seed in tqdm(range(SPLITS["tune"], SPLITS["tune"] + scenes), desc=task_name):
         scene = locate(context, task.reset(seed))
         drawn = sample(context, scene, model, settings, NUM_QUERIES)
         yield seed, context, scene, propose(context, scene, drawn, NUM_QUERIES)

@@ -1,14 +1,23 @@
-"""Once a test run: demonstrations and a scene of the real simulator are recorded, and Ctrl-C is made to work."""
+"""Demonstrations and a scene of the real simulator, recorded once in a test run; Ctrl-C is made to work."""
 
+import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from robust_instant_policy.cli import main
 
 NUM_DEMONSTRATIONS = 5
+# These files take the most time. They come first, so that all workers end at about the same time.
+LONGEST = ("evaluation_workers", "diffusion", "demo", "tasks_aloha", "llm_embedded", "docs")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    places = {f"test_{name}": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -20,12 +29,25 @@ def ctrl_c() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def workbench(tmp_path_factory) -> Path:
-    """A folder with ``data/push-cube`` (a few demonstrations) and ``observation.npz`` (a new scene)."""
+def workbench(tmp_path_factory, worker_id) -> Path:
+    """A folder with ``data/push-cube`` (a few demonstrations) and ``observation.npz`` (a new scene).
+
+    Each worker has a copy of its own, because tests write into it.
+    """
+    base = tmp_path_factory.getbasetemp()
+    shared = (base if worker_id == "master" else base.parent) / "recorded"
+    with FileLock(f"{shared}.lock"):
+        if not shared.exists():
+            _record(shared.with_suffix(".part"))
+            shared.with_suffix(".part").rename(shared)
+    return Path(shutil.copytree(shared, base / "workbench"))
+
+
+def _record(folder: Path) -> None:
     from robust_instant_policy.evaluation import scene_seed
     from robust_instant_policy.tasks import make_task
 
-    folder = tmp_path_factory.mktemp("workbench")
+    folder.mkdir()
     command = ["record", "--task", "push-cube", "--episodes", str(NUM_DEMONSTRATIONS)]
     assert main([*command, "--out", str(folder / "data" / "push-cube")]) == 0
     task = make_task("push-cube")
@@ -33,4 +55,3 @@ def workbench(tmp_path_factory) -> Path:
         task.reset(scene_seed(0, 0)).save(folder / "observation.npz")
     finally:
         task.close()
-    return folder

@@ -29,6 +29,7 @@ import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -91,6 +92,24 @@ def run(target: Target, case: bytes) -> Outcome:
     seconds = time.process_time() - start
     assert seconds < LIMIT_S, f"took {seconds:.1f} s"
     return Outcome(accepted, seconds)
+
+
+def fuzz(target: Target, count: int, first_seed: int, check: Callable[[Case], None]) -> None:
+    """Call ``check`` with ``count`` cases of ``target``; the last one that it fails for is the smallest."""
+
+    @seed(first_seed)
+    @settings(
+        max_examples=count,
+        deadline=None,
+        database=None,
+        report_multiple_bugs=False,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(case=target.cases)
+    def each(case: Case) -> None:
+        check(case)
+
+    each()
 
 
 @contextmanager

@@ -62,6 +62,10 @@ def test_what_belongs_to_something_else_is_refused_and_left_alone(tmp_path, caps
     code, line = refused(["samples", str(tmp_path / "bookmarks.sqlite")], capsys)
     assert (code, "another program" in line) == (2, True)
     assert (tmp_path / "bookmarks.sqlite").read_bytes() == before
+    (tmp_path / "samples.sqlite").touch()
+    code, line = refused(["samples", str(tmp_path / "samples.sqlite")], capsys)
+    assert (code, "is empty" in line) == (2, True)
+    assert (tmp_path / "samples.sqlite").read_bytes() == b""
     (tmp_path / "episodes.parquet").touch()
     code, line = refused(["demo", "--out", str(tmp_path)], capsys)
     assert (code, "holds an evaluation" in line) == (2, True)

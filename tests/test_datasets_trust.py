@@ -17,7 +17,7 @@ from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.geometry import GripperTriangle
 from robust_instant_policy.policies.policy import Plan
-from tests.datasets_samples import demonstration, observation
+from tests.datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration, observation
 from tests.fuzz_targets import damaged_folder, foreign_files, recorded_files
 
 FILES = (
@@ -108,6 +108,16 @@ def test_only_regular_files_of_the_folder_are_opened(kind, file):
 def test_an_entry_of_the_wrong_type_or_range_is_named(folder, name, value, words):
     change_info(folder, **{name: value})
     assert words in refusal(load_demonstrations, folder)
+
+
+def test_more_episodes_than_are_counted_are_told(tmp_path):
+    with DatasetWriter(tmp_path, task=TASK, description=DESCRIPTION, rate_hz=RATE_HZ) as writer:
+        for seed in range(4):
+            writer.add(demonstration(seed))
+    change_info(tmp_path, total_episodes=3)  # the writer was killed before it finished the fourth
+    assert len(load_demonstrations(tmp_path)) == 3
+    change_info(tmp_path, total_episodes=2)
+    assert "counts 2 episodes, meta/episodes lists more" in refusal(load_demonstrations, tmp_path)
 
 
 def test_deep_json_is_refused(folder):

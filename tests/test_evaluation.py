@@ -37,10 +37,20 @@ from robust_instant_policy.evaluation import (
     read_results,
     scene_seed,
 )
-from robust_instant_policy.evaluation.experiment import missing_work, plan_file, wanted_trials
+from robust_instant_policy.evaluation.experiment import by_trial, missing_work, plan_file, wanted_trials
 from robust_instant_policy.evaluation.failures import video_file
 from robust_instant_policy.evaluation.manifest import PACKAGE, code_digest
-from robust_instant_policy.evaluation.statistics import Summary, mark, paired_test, t_test, wilson_interval
+from robust_instant_policy.evaluation.scenes import SEEDS_A_SET, first_demonstration_seed
+from robust_instant_policy.evaluation.statistics import (
+    Summary,
+    difference_interval,
+    holm,
+    mark,
+    paired_test,
+    scene_interval,
+    t_test,
+    wilson_interval,
+)
 from robust_instant_policy.evaluation.variant import labels
 from robust_instant_policy.evaluation.work import SceneWork
 from robust_instant_policy.evaluation.workers import MAX_DEATHS, Agenda
@@ -272,6 +282,7 @@ def test_code_that_decides_results_makes_other_rows_and_a_command_does_not(tmp_p
 
 def test_any_seed_draws_a_scene_of_its_own_that_tables_can_hold(tmp_path):
     assert scene_seed(3, 4) == 103_004
+    assert scene_seed(3, 4, "test") == 1_003_004
     seeds = [scene_seed(seed, index) for seed in (0, 4_294_867, 10**18, 10**40) for index in range(3)]
     assert len(set(seeds)) == len(seeds)
     keep(tmp_path, *(episode(RIP, seed, True) for seed in seeds))
@@ -282,15 +293,15 @@ def test_any_seed_draws_a_scene_of_its_own_that_tables_can_hold(tmp_path):
 def test_work_goes_on_with_the_executions_that_are_missing(tmp_path):
     suite = Suite("chosen", ("push-cube",), (RIP, KAT), (1, 2, 3))
     rows = [episode(RIP, 1, True), episode(KAT, 1, True, of=2), episode(RIP, 2, True), episode(KAT, 2, True)]
-    works = missing_work(wanted_trials([suite]), [], rows, [], tmp_path, films=False)
+    works = missing_work(wanted_trials([suite]), [], by_trial(rows), [], tmp_path, films=False)
     assert [(work.scene.seed, work.variants) for work in works] == [(1, (KAT,)), (3, (RIP, KAT))]
     assert (Scene("push-cube", "seen", 1), KAT, 0) in works[0].done
 
 
-def test_a_failed_episode_that_nobody_examined_is_work_left(tmp_path):
+def test_a_failed_episode_without_an_analysis_is_work_left(tmp_path):
     suite = Suite("chosen", ("push-cube",), (RIP,), (1,))
     lost = episode(RIP, 1, False)
-    (work,) = missing_work(wanted_trials([suite]), [], [lost], [], tmp_path, films=False)
+    (work,) = missing_work(wanted_trials([suite]), [], by_trial([lost]), [], tmp_path, films=False)
     assert work.failed == (lost,)
     assert not work.variants
 
@@ -319,14 +330,117 @@ def test_an_unknown_suite_task_or_method_is_told():
         make_suites(["table1"], Choice(RIP, methods=["magic"]))
 
 
-def test_the_table_counts_every_execution_marks_the_best_and_shows_the_papers_number():
+PAPER = {"frames": "world", "layout": "sequence", "keypoints": "nearest", "column": "sim", "estimator": "network-sim"}
+
+
+def test_the_table_counts_every_execution_and_marks_the_best():
     suite = Suite("table1", ("push-cube",), (RIP, KAT), tuple(range(4)))
     rows = [episode(RIP, seed, True) for seed in range(4)]
     rows += [episode(KAT, seed, candidate < 2, candidate, of=5) for seed in range(4) for candidate in range(5)]
     success, tests = (table.markdown() for table in tables(Summary(suite, rows)))
-    assert "| rip | **100** (51 to 100) | 100 | 100.0 ± 0.0 | 100 ± 0 |" in success
-    assert "| kat | 40 (22 to 61) | 74 | 40.0 ± 0.0 | 74 ± 0 |" in success
-    assert "| kat | +60.0 | – | 4 | 4 | 0 | 0.125 |" in tests
+    assert "| rip | **100** (51 to 100) | 100.0 ± 0.0 |" in success
+    assert "| kat | 40 (10 to 80) | 40.0 ± 0.0 |" in success
+    assert "| kat | +60.0 (+60.0 to +60.0) | 4 | 4 | 0 | 0.125 | 0.125 | – |" in tests
+
+
+def test_the_papers_numbers_stand_beside_rows_of_its_configuration_only(tmp_path):
+    dp = Variant("dp")
+    ours = (RIP, replace(RIP, **PAPER), replace(RIP, **PAPER | {"keypoints": "registration"}), dp)
+    assert [one.config for one in ours] == ["adaptive", "paper", "paper, keypoints registration", ""]
+    a_run(tmp_path, Suite("table1", ("push-cube",), ours, (1,)), [episode(one, 1, True) for one in ours], [])
+    publish(tmp_path)
+    heads = {path.name: path.read_text().splitlines() for path in tmp_path.glob("table1-*.md")}
+    assert heads.keys() == {"table1-adaptive.md", "table1-paper.md", "table1-paper-keypoints-registration.md"}
+    assert heads["table1-paper.md"][0] == "| method | push-cube | paper | average | paper |"
+    assert [line.split(" | ")[2] for line in heads["table1-paper.md"][2:4]] == ["100", "30"]
+    for name in heads.keys() - {"table1-paper.md"}:
+        assert heads[name][0] == "| method | push-cube | average |"
+    assert "Configuration: adaptive" in "".join(heads["table1-adaptive.md"])
+    assert set(pq.read_table(tmp_path / "episodes.parquet")["config"].to_pylist()) == {one.config for one in ours}
+
+
+def test_the_papers_estimator_fitted_exactly_is_a_row_of_its_own_in_its_configuration():
+    network = replace(RIP, **PAPER)
+    exact = replace(network, estimator="em-number")
+    assert exact != network
+    assert exact.config == network.config == "paper"
+    assert labels([network, exact, RIP]) == [
+        "rip (config paper, estimator network-sim)", "rip (config paper, estimator em-number)",
+        "rip (config adaptive, estimator em)",
+    ]  # fmt: skip
+    assert len({one.file_name for one in (network, exact, RIP)}) == 3
+
+
+def test_candidates_of_one_scene_are_not_counted_as_trials():
+    suite = Suite("table1", ("push-cube",), (KAT,), tuple(range(10)))
+    rows = [episode(KAT, seed, seed < 5, candidate, of=5) for seed in range(10) for candidate in range(5)]
+    rate = Summary(suite, rows).rate(KAT)
+    assert (rate.value, rate.scenes, rate.trials) == (0.5, 10, 50)
+    assert rate.interval == pytest.approx(wilson_interval(5, 10))  # not that of 25 of 50
+
+
+@given(st.integers(1, 40).flatmap(lambda trials: st.tuples(st.integers(0, trials), st.just(trials))))
+def test_with_one_execution_a_scene_the_interval_is_wilsons(counts):
+    successes, trials = counts
+    assert scene_interval(successes / trials, trials) == pytest.approx(wilson_interval(successes, trials), abs=1e-9)
+
+
+def test_sets_of_demonstrations_are_averaged_and_shown_side_by_side():
+    sets = tuple(replace(RIP, demo_set=number) for number in range(3))
+    suite = Suite("table1", ("push-cube",), sets, tuple(range(10)))
+    rows = [episode(one, seed, seed < 10 - one.demo_set) for one in sets for seed in range(10)]
+    summary = Summary(suite, rows)
+    assert summary.variants == [RIP]
+    assert summary.rate(RIP).value == pytest.approx(0.9)
+    assert summary.rate(RIP).scenes == 10  # the three sets met the same scenes
+    assert summary.of_sets(RIP) == {0: 1.0, 1: 0.9, 2: 0.8}
+    assert (
+        dict(zip(tables(summary)[0].head, tables(summary)[0].rows[0], strict=True))["with each set"]
+        == "100.0, 90.0, 80.0"
+    )
+
+
+def test_methods_are_compared_with_the_sets_of_demonstrations_that_both_have():
+    other, gp = replace(RIP, demo_set=1), Variant("gp")
+    suite = Suite("table1", ("push-cube",), (RIP, other, gp), tuple(range(4)))
+    rows = [episode(variant, seed, variant != other) for variant in (RIP, other, gp) for seed in range(4)]
+    (found,) = Summary(suite, rows).compare(RIP)
+    assert found.difference == 0.0  # RIP failed with the second set, which gp was not shown
+
+
+def test_holms_correction_agrees_with_the_published_example():
+    # Holm 1979, as in the example of R's p.adjust: sorted p-values times the number that is left, never falling.
+    assert holm([0.01, 0.04, 0.03, math.nan]) == pytest.approx([0.03, 0.06, 0.06, math.nan], nan_ok=True)
+    assert holm([0.6, 0.9]) == [1.0, 1.0]
+
+
+def test_the_interval_of_a_difference_resamples_scenes_and_weighs_tasks_alike():
+    ours = {Scene(task, "seen", seed): Fraction(1) for task, count in (("a", 10), ("b", 40)) for seed in range(count)}
+    theirs = {scene: Fraction(int(scene.task == "b")) for scene in ours}
+    assert difference_interval(ours, theirs) == pytest.approx((0.5, 0.5))
+    half = {scene: Fraction(scene.seed % 2) for scene in ours}
+    low, high = difference_interval(ours, half)
+    assert 0.3 < low < 0.5 < high < 0.7
+
+
+def test_hard_scenes_are_rows_of_their_own_with_objects_that_no_demonstration_showed(tmp_path):
+    choice = Choice(RIP, tasks=["push-cube", "turn-faucet"], methods=["rip"], num_scenes=1)
+    (usual,), (hard,) = make_suites(["table1"], choice), make_suites(["table1"], replace(choice, level="hard"))
+    assert [str(scene) for scene in hard.scenes] == ["push-cube-seen-1000000-hard", "turn-faucet-unseen-1000000-hard"]
+    rows = tuple(replace(episode(RIP, 0, True), scene=scene) for scene in (*usual.scenes, *hard.scenes))
+    keep(tmp_path, *rows)
+    assert read_results(tmp_path).episodes == rows
+    assert len(Summary(usual, rows).rows) == len(Summary(hard, rows).rows) == 2
+
+
+def test_scenes_of_demonstrations_tuning_and_tests_never_meet():
+    shown = {first_demonstration_seed(number) + index for number in range(20) for index in range(SEEDS_A_SET)}
+    tuned = {scene_seed(seed, index, "tune") for seed in range(50) for index in range(200)}
+    tested = {scene_seed(seed, index, "test") for seed in range(50) for index in range(200)}
+    assert not (shown | tuned) & tested
+    assert not shown & tuned
+    (suite,) = make_suites(["table1"], Choice(RIP, num_scenes=3))
+    assert set(suite.seeds) <= tested
 
 
 @pytest.mark.parametrize("name", ["demos", "queries", "dof", "downsampling"])
@@ -352,7 +466,7 @@ def test_rip_is_compared_over_the_tasks_that_the_other_method_was_tried_in():
     rows = [episode(variant, seed, variant == RIP or seed == 0) for variant in (RIP, dp) for seed in (0, 1)]
     elsewhere = [replace(row, scene=replace(row.scene, task="open-drawer"), success=False) for row in rows[:2]]
     against = tables(Summary(suite, rows + elsewhere))[1]
-    assert dict(zip(against.head, against.rows[0], strict=True))["difference"] == "+50.0"  # not 50 - 50
+    assert dict(zip(against.head, against.rows[0], strict=True))["difference"].startswith("+50.0 (")  # not 50 - 50
 
 
 def test_methods_without_a_task_in_common_are_not_compared():
@@ -360,7 +474,7 @@ def test_methods_without_a_task_in_common_are_not_compared():
     elsewhere = replace(episode(KAT, 0, True), scene=Scene("open-drawer", "seen", 0))
     success, against = tables(Summary(suite, [episode(RIP, 0, True), elsewhere]))
     assert len(success.rows) == 2
-    assert against.rows[0][1:] == ("–", "–", "0", "0", "0", "–")
+    assert against.rows[0][1:] == ("–", "0", "0", "0", "–", "–", "–")
 
 
 def test_variants_that_differ_in_the_model_only_are_told_apart_everywhere():
@@ -453,12 +567,12 @@ def test_what_table1_shows_has_no_section_of_its_own_in_the_report(tmp_path):
     table1, chosen = (Suite(name, ("push-cube",), (RIP,), (1,)) for name in ("table1", "chosen"))
     a_run(tmp_path, chosen, [episode(RIP, 1, True)], [])
     publish(tmp_path)
-    assert (tmp_path / "chosen.md").exists()
-    (tmp_path / "chosen.md").unlink()
+    assert (tmp_path / "chosen-adaptive.md").exists()
+    (tmp_path / "chosen-adaptive.md").unlink()
     a_run(tmp_path, table1, [], [])
     publish(tmp_path)
-    assert (tmp_path / "table1.md").exists()
-    assert not (tmp_path / "chosen.md").exists()
+    assert (tmp_path / "table1-adaptive.md").exists()
+    assert not (tmp_path / "chosen-adaptive.md").exists()
 
 
 def test_a_terminal_that_knows_ascii_only_shows_other_signs(tmp_path):
@@ -485,8 +599,8 @@ def test_objects_of_code_and_downloaded_ones_have_a_table_each(tmp_path):
         suite = Suite("table1", ("push-cube",), (KAT,), (1,), assets=assets)
         a_run(tmp_path, suite, [replace(episode(KAT, 1, won), scene=scene)], [])
     publish(tmp_path)
-    assert "**100**" in (tmp_path / "table1.md").read_text()
-    assert "**0**" in (tmp_path / "table1-maniskill.md").read_text()
+    assert "**100**" in (tmp_path / "table1-adaptive.md").read_text()
+    assert "**0**" in (tmp_path / "table1-adaptive-maniskill.md").read_text()
 
 
 def test_a_worker_stays_with_its_task_and_others_take_another():

@@ -345,10 +345,12 @@ def test_the_page_tells_every_failure_with_its_film_and_needs_nothing_beside_it(
     assert "regression: one of its candidates" in page
     assert "rip eval --out x" in page
     assert not re.search(r'(src|href)="(http|/)', page)
-    assert {"table1.svg", "table1.png", "table1.md", "failures.md", "table.md"} <= set(os.listdir(tmp_path))
-    before = (tmp_path / "table1.svg").read_bytes()
+    assert {"table1-adaptive.svg", "table1-adaptive.png", "table1-adaptive.md", "failures.md", "table.md"} <= set(
+        os.listdir(tmp_path)
+    )
+    before = (tmp_path / "table1-adaptive.svg").read_bytes()
     assert main(["report", str(tmp_path)]) == 0
-    assert (tmp_path / "table1.svg").read_bytes() == before
+    assert (tmp_path / "table1-adaptive.svg").read_bytes() == before
 
 
 def test_a_folder_without_executions_has_no_page(tmp_path):
@@ -372,6 +374,6 @@ def test_figures_are_drawn_for_every_analysis(tmp_path):
         store.add(*rows)
     publish(tmp_path)
     for suite in suites:
-        drawing = (tmp_path / f"{suite.name}.svg").read_text()
+        drawing = (tmp_path / f"{suite.name}-adaptive.svg").read_text()
         assert "success [%]" in drawing
-        assert (tmp_path / f"{suite.name}.png").stat().st_size > 10_000
+        assert (tmp_path / f"{suite.name}-adaptive.png").stat().st_size > 10_000

@@ -177,7 +177,6 @@ def test_a_model_that_chats_is_asked_by_chat(server):
 
 def test_the_server_says_how_it_counts_and_how_far_it_looks_back(server):
     model = connect(f"{server}/v1#anything")
-    assert model.counts_exactly
     assert model.context_length == 256
     assert model.count_tokens("12 3") == 5  # <bos> 1 2 ␣ 3
 

@@ -29,7 +29,6 @@ class CountingModel:
 
     name = "counting"
     context_length = None
-    counts_exactly = True
 
     def __init__(self) -> None:
         self.asked = 0

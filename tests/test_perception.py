@@ -101,6 +101,23 @@ def test_keypoints_survive_a_noisy_camera(demonstrations):
     assert accuracy.worst_tenth <= 0.025
 
 
+def test_nearest_descriptors_find_the_same_points_of_an_object_that_is_moved():
+    shown, new = scenes(5, seed=0, turn=10.0), scenes(8, seed=1, turn=10.0)
+    images = [s.observation for s in shown], [s.observation for s in new]
+    extractor = KeypointExtractor(features="efficientnet", correspondence="nearest").fit(images[0])
+    accuracy = measure(extractor, images[0], shown, images[1], new)
+    assert accuracy.on_object >= 6
+    assert accuracy.median <= 0.010
+    again = KeypointExtractor(features="efficientnet", correspondence="nearest").fit(images[0])
+    np.testing.assert_array_equal(again.keypoints_, extractor.keypoints_)
+
+
+def test_nearest_descriptors_of_images_without_an_object_in_common_are_refused():
+    empty = [Scene(0, 0, 0, present=False).observation, scenes(1, seed=0)[0].observation]
+    with pytest.raises(KeypointError, match="nothing in common"):
+        KeypointExtractor(features="efficientnet", correspondence="nearest").fit(empty)
+
+
 def test_the_same_seed_gives_the_same_keypoints(extractor, demonstrations):
     again = KeypointExtractor(features="efficientnet").fit([scene.observation for scene in demonstrations])
     np.testing.assert_array_equal(again.keypoints_, extractor.keypoints_)

@@ -16,7 +16,7 @@ from robust_instant_policy.policies import (
     build_context,
     locate,
 )
-from robust_instant_policy.policies.confidence import UNKNOWN, Evidence, novelty, plan_confidence
+from robust_instant_policy.policies.confidence import UNKNOWN, Evidence, distortion, novelty, plan_confidence
 from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.query import Answer
 from robust_instant_policy.tasks import make_task
@@ -27,7 +27,7 @@ SETTINGS = Settings(features="efficientnet")
 class Imitator:
     """Stands in for a language model: answers with the prompt's own examples, or with ``says``; some are ``lost``."""
 
-    name, context_length, counts_exactly = "imitator", None, False
+    name, context_length = "imitator", None
 
     def __init__(self, lost=(), says=None):
         self.lost, self.says = lost, says
@@ -152,12 +152,31 @@ def test_a_setting_that_makes_no_sense_is_refused_where_it_is_given(options):
     assert "\n" not in str(caught.value)
 
 
-SURE = Evidence(agreement=0.9, keypoints=0.8, prediction=0.008, novelty=0.9, warnings=0, errors=0)
+SURE = Evidence(
+    agreement=0.9,
+    distortion=0.5,
+    prediction=0.008,
+    novelty=0.4,
+    displacement=0.004,
+    precision=0.004,
+    doubts=0,
+    warnings=0,
+    errors=0,
+)
 
 
 @pytest.mark.parametrize(
     "worse",
-    [{"agreement": 0.1}, {"keypoints": 0.3}, {"prediction": 0.05}, {"novelty": 4.0}, {"warnings": 2}],
+    [
+        {"agreement": 0.1},
+        {"distortion": 5.0},
+        {"prediction": 0.05},
+        {"novelty": 4.0},
+        {"displacement": 0.04},
+        {"precision": 0.04},
+        {"doubts": 1},
+        {"warnings": 2},
+    ],
     ids=lambda worse: next(iter(worse)),
 )
 def test_confidence_falls_with_everything_that_speaks_against_a_plan(worse):
@@ -179,8 +198,19 @@ def test_demonstrations_of_one_scene_tell_nothing_about_others():
     one_scene = np.zeros((10, 4, 3))
     assert np.isnan(novelty(one_scene, np.full((4, 3), 0.1)))
     apart = np.random.default_rng(0).normal(0, 0.1, (10, 4, 3))
-    assert novelty(apart, apart[3]) == 0
+    assert novelty(apart, apart[3]) < 1
     assert novelty(apart, apart[3] + 1.0) > 3
+
+
+def test_keypoints_that_slip_on_a_rigid_thing_are_measured():
+    random = np.random.default_rng(0)
+    thing = random.normal(0, 0.05, (6, 3))
+    scenes = thing + random.normal(0, 0.1, (10, 1, 3)) + random.normal(0, 0.001, (10, 6, 3))
+    new = thing + 0.1
+    assert distortion(scenes, new) < 1
+    new[:2] += 0.03
+    assert distortion(scenes, new) > 3
+    assert np.isnan(distortion(scenes[:2], new))
 
 
 def test_old_names_still_work_with_a_warning():

@@ -18,7 +18,7 @@ def lengths(actions):
     return np.linalg.norm((left + right) / 2 - palm, axis=1), np.linalg.norm(left - right, axis=1)
 
 
-@pytest.mark.parametrize("estimator", ["em", "mixture", "median"])
+@pytest.mark.parametrize("estimator", ["em", "em-number", "mixture", "median", "mean"])
 @pytest.mark.parametrize("dof", [1.5, np.inf])
 def test_gripper_is_rigid_with_a_clean_state(estimator, dof):
     for kind in KINDS:
@@ -121,8 +121,10 @@ def test_length_of_the_result_can_be_chosen():
 
 def test_bad_arguments_are_refused():
     good = draw_scene(0, "smooth", 3, 0).candidates
-    with pytest.raises(UnknownNameError, match="em, network, network-sim, network-real, mixture, median"):
-        robust_gripper_trajectory(good, estimator="mean")
+    with pytest.raises(
+        UnknownNameError, match="em, em-number, network-sim, network-real, network, mixture, median, mean"
+    ):
+        robust_gripper_trajectory(good, estimator="mode")
     with pytest.raises(InvalidValueError, match=r"\(T_q, 10·A\).*9"):
         robust_gripper_trajectory([c[:, :9] for c in good])
 

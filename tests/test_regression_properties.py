@@ -8,7 +8,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.regression import StudentTMixture, StudentTRegression, robust_gripper_trajectory
+from robust_instant_policy.regression import (
+    StudentTMixture,
+    StudentTNumbers,
+    StudentTRegression,
+    robust_gripper_trajectory,
+)
 from robust_instant_policy.regression.candidates import Candidates
 from robust_instant_policy.regression.likelihood import evaluate, log_likelihood
 from robust_instant_policy.regression.student_t import solve
@@ -87,13 +92,19 @@ def test_rigid_motions_of_the_input_move_the_output_alike(seed, kind, estimator)
 
 @SETTINGS
 @given(candidates(equal_lengths=True), st.sampled_from(["step", "trajectory", "number"]))
-def test_towards_infinite_degrees_of_freedom_the_fit_becomes_the_mean(given_candidates, unit):
-    mean = np.mean(given_candidates, axis=0)
+def test_the_gaussian_ablation_is_the_same_estimator_at_the_end_of_nu(given_candidates, unit):
     gaussian = StudentTRegression(dof=np.inf, unit=unit).fit(given_candidates)
-    assert np.allclose(gaussian.mean(), mean, atol=1e-9)
-    assert all((weight == 1).all() for weight in gaussian.weights)
-    nearly = StudentTRegression(dof=1e7, unit=unit).fit(given_candidates)
-    assert np.allclose(nearly.mean(), mean, atol=1e-4)
+    nearly = StudentTRegression(dof=1e9, unit=unit).fit(given_candidates)
+    assert np.allclose(nearly.mean(), gaussian.mean(), atol=1e-4)
+    assert np.allclose(nearly.scale(), gaussian.scale(), atol=1e-4)
+
+
+@SETTINGS
+@given(candidates(equal_lengths=True))
+def test_the_gaussian_of_every_number_is_the_mean(given_candidates):
+    fit = StudentTNumbers(dof=np.inf).fit(given_candidates)
+    assert np.allclose(fit.mean(), np.mean(given_candidates, axis=0), atol=1e-9)
+    assert all((weight == 1).all() for weight in fit.weights)
 
 
 @SETTINGS

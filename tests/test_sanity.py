@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,16 +14,19 @@ from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import load_demonstrations
-from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.geometry import GripperTriangle, make_pose
 from robust_instant_policy.sanity import (
     DemonstrationError,
     EnvelopeError,
     GeometryError,
+    Surroundings,
+    View,
     check_demonstrations,
     errors,
 )
 from robust_instant_policy.tasks.camera_noise import CameraNoise
-from robust_instant_policy.trajectory import downsample
+from robust_instant_policy.trajectory import Trajectory, downsample
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +81,9 @@ def test_the_noise_of_a_depth_camera_is_no_error(demonstrations, scene):
         ("mirrored:demos", "mirrored"),
         ("camera-10cm-low:demos", "camera"),
         ("camera-10cm-high:demos", "below the table"),
+        ("depth-stripe:demos", "rows"),
+        ("radians-as-degrees:demos", "Euler angles read as radians"),
+        ("degrees-as-radians:demos", "Euler angles in degrees taken for radians"),
     ],
 )
 def test_demonstrations_whose_geometry_is_wrong_are_refused_and_the_mistake_is_named(demonstrations, fault, words):
@@ -147,11 +154,83 @@ def test_another_camera_is_no_error_where_its_calibration_is_right(report, scene
         ("100x-longer:demos", "times as long"),
         ("contradicts:demos", "demonstration 4 contradicts"),
         ("tasks-mixed:demos", "several tasks"),
+        ("reversed:demos", "backwards in time"),
     ],
 )
 def test_demonstrations_that_do_not_belong_together_are_refused(demonstrations, fault, words):
     with pytest.raises((DemonstrationError, GeometryError), match=words):
         check_demonstrations(FAULTS[fault].demonstrations(demonstrations)).raise_if_wrong()
+
+
+def test_states_inverted_while_pushing_are_doubted(demonstrations):
+    inverted = FAULTS["state-inverted:demos"].demonstrations(demonstrations)
+    assert any("are its states inverted" in note for note in check_demonstrations(inverted).notes)
+    assert not any("inverted" in note for note in check_demonstrations(demonstrations).notes)
+
+
+def block(middle, size=(0.12, 0.04, 0.05)):
+    """A camera 0.6 m above a table with a block on it."""
+    intrinsics = np.array([[300.0, 0, 99.5], [0, 300, 99.5], [0, 0, 1]])
+    pose = make_pose(np.diag([1.0, -1, -1]), (0, 0, 0.6))
+    rows, cols = np.mgrid[:200, :200]
+    top = 0.6 - size[2]
+    x, y = (cols - 99.5) * top / 300 - middle[0], -(rows - 99.5) * top / 300 - middle[1]
+    inside = (np.abs(x) < size[0] / 2) & (np.abs(y) < size[1] / 2)
+    grain = np.random.default_rng(0).integers(90, 160, (200, 200, 1), dtype=np.uint8)
+    rgb = np.where(inside[..., None], np.uint8([200, 40, 40]), grain)
+    return Observation(rgb, np.where(inside, top, 0.6).astype(np.float32), intrinsics, pose)
+
+
+def grasps(by=(0.0, 0.0, 0.0), count=8):
+    """Blocks at several places, each grasped from above; the paths displaced ``by`` metres."""
+    found = []
+    for index, middle in enumerate(np.random.default_rng(1).uniform(-0.08, 0.08, (count, 2))):
+        above, low = np.array([*middle, 0.15]) + by, np.array([*middle, 0.02]) + by
+        places = np.concatenate([np.linspace([0.3, 0.3, 0.3], above, 15), np.linspace(above, low, 15)])
+        places = np.concatenate([places, np.repeat(low[None], 5, axis=0), np.linspace(low, above, 10)])
+        poses = np.stack([make_pose(np.diag([1.0, -1, -1]), place) for place in places])
+        trajectory = Trajectory.from_poses(poses, np.arange(len(places)) >= 30, GripperTriangle(0.15, 0.08))
+        found.append(Demonstration(block(middle), trajectory, 20.0, "grasp", index))
+    return found
+
+
+def test_grasps_beside_or_above_what_the_image_shows_are_doubted():
+    def doubts(by):
+        return [f.message for f in check_demonstrations(grasps(by)).findings if f.kind == "grasp"]
+
+    assert not doubts((0, 0, 0))
+    assert not doubts((0.02, 0, 0))  # along the fingers' faces: as good a grasp as any
+    assert re.search("whose middle lies 2[3-7] mm beside the gripper's", doubts((0, 0.025, 0))[0])
+    assert "above or beside a surface" in doubts((0, 0, 0.04))[0]
+
+
+def test_a_plan_beside_the_demonstrated_place_of_a_thing_is_measured():
+    demonstrations = grasps(count=9)
+    new, shown = demonstrations[0], demonstrations[1:]
+    views = [View.of(one.observation) for one in shown]
+    surroundings = Surroundings.of(views, np.stack([one.trajectory.actions for one in shown]))
+    assert surroundings.precision < 0.01
+    view, actions = View.of(new.observation), new.trajectory.actions
+    assert surroundings.displacement(view, actions) < 0.01
+    beside = actions.copy()
+    beside[:, [0, 3, 6]] += 0.024
+    assert surroundings.displacement(view, beside) == pytest.approx(0.024, abs=0.007)
+
+
+def test_too_few_demonstrations_measure_no_displacement():
+    few = grasps(count=2)
+    surroundings = Surroundings.of(
+        [View.of(one.observation) for one in few], np.stack([one.trajectory.actions for one in few])
+    )
+    assert np.isnan(surroundings.precision)
+    assert np.isnan(surroundings.displacement(View.of(few[0].observation), few[0].trajectory.actions))
+
+
+def test_which_of_two_arms_is_which_is_told_to_be_unchecked():
+    two = [
+        replace(one, trajectory=Trajectory.from_actions(np.tile(one.trajectory.actions, (1, 2)))) for one in grasps()
+    ]
+    assert any("which arm is which was not checked" in note for note in check_demonstrations(two).notes)
 
 
 def test_grippers_that_never_close_are_doubted(demonstrations):

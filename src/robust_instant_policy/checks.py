@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robust_instant_policy.errors import InvalidValueError
+from robust_instant_policy.geometry import as_numbers
 
 
 def checked_positive(name: str, value: object, infinite: bool = False) -> float:
@@ -32,18 +33,13 @@ def checked_array(name: str, values: ArrayLike, shape: str) -> NDArray[np.float6
 
     Text, booleans, complex numbers, NaN and infinity raise `InvalidValueError`.
     """
-    try:
-        array = np.asarray(values)
-    except (TypeError, ValueError) as error:
-        raise InvalidValueError(f"{name} must be {shape}, an array of numbers: {error}") from None
-    if array.dtype.kind not in "iuf" and array.size:
-        raise InvalidValueError(f"{name} must be {shape}, an array of numbers, got elements of type {array.dtype}")
+    array = as_numbers(f"{name} {shape}", values)
     if array.ndim != len(shape.strip("()").removesuffix(",").split(",")):
         raise InvalidValueError(f"{name} must be {shape}, got shape {array.shape}")
     if not np.isfinite(array).all():
         first = tuple(int(index) for index in np.argwhere(~np.isfinite(array))[0])
         raise InvalidValueError(f"{name} of shape {array.shape} holds values that are not finite (first at {first})")
-    return array.astype(np.float64)
+    return array
 
 
 def _is_number(value: object, kind: type) -> bool:

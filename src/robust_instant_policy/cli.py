@@ -12,20 +12,20 @@ from collections.abc import Sequence
 from robust_instant_policy import __version__
 from robust_instant_policy.errors import RipError
 
-# A command is the module of its name in `commands`. Only the one that runs is imported: others may need much more.
+# Each command is a module in `commands`. Only the one that runs is imported, because others may need more packages.
 COMMANDS = {
-    "demo": "record demonstrations, plan in a new scene, execute, explain",
+    "demo": "record demonstrations, plan in a new scene, execute, and write a report",
     "record": "record demonstrations into a dataset folder",
-    "check": "whether demonstrations, images and a new scene fit together; names what is wrong",
-    "plan": "plan for one observation and write plan.json; nothing moves",
-    "eval": "the paper's evaluation, or a part of it; goes on where it stopped",
-    "train": "train dp or kat-dp on demonstrations; goes on where it stopped",
+    "check": "check demonstrations, and a new scene, against each other, and name likely mistakes",
+    "plan": "plan for one observation and write plan.json; nothing is executed",
+    "eval": "run the paper's evaluation, or a part of it; continues an interrupted run",
+    "train": "train dp or kat-dp on demonstrations; continues an interrupted training",
     "report": "write the report of a run, or of an evaluation, again",
-    "merge": "bring several evaluations together in one folder",
-    "view": "a page that shows every demonstration of a folder",
-    "keypoints": "a page with the keypoints of demonstrations and new scenes, measured",
-    "samples": "what a file of stored answers holds; export it",
-    "doctor": "what works on this machine, and what to do about what does not",
+    "merge": "combine several evaluations in one folder",
+    "view": "write a page that shows every demonstration of a folder",
+    "keypoints": "write a page with the keypoints of demonstrations and new scenes, and their errors",
+    "samples": "count or export the stored answers of a language model",
+    "doctor": "check this machine, and say how to install what is missing",
 }
 
 
@@ -34,21 +34,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that lacks a sign shows another
+        if isinstance(stream, io.TextIOWrapper):  # characters that the terminal lacks become ?
             stream.reconfigure(errors="replace")
     try:
         options = parse(arguments)
         options.arguments = arguments
         return options.run(options)
     except KeyboardInterrupt:
-        print("rip: stopped; what was finished is kept, run the same command again to go on", file=sys.stderr)
+        print("rip: stopped; finished work is kept; run the same command again to continue", file=sys.stderr)
         return 1
     except RipError as error:
         if debug:
             raise
         print(f"rip: {error}", file=sys.stderr)
         return error.exit_code
-    except BrokenPipeError:  # the reader, such as head, has seen enough
+    except BrokenPipeError:  # the reader, such as head, has closed the pipe
         sys.stderr.close()
         return 0
     except OSError as error:
@@ -85,7 +85,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 def _describe(error: OSError) -> str:
     where = f" at {error.filename}" if error.filename else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"no space left{where}; free some and run the same command again to go on"
+        return f"no space left{where}; free some and run the same command again to continue"
     return f"{error.strerror or error}{where}"
 
 

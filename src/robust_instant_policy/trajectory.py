@@ -26,7 +26,8 @@ class Trajectory:
     """A sequence of gripper triplets with gripper state, over normalised time.
 
     ``actions (T, 10·A)`` float64, for A arms (nearly always one), each: gripper point xyz, two open-fingertip
-    points xyz (metres, world frame), gripper state g (0 open, 1 closed; a measured one may lie between).
+    points xyz (metres, world frame), gripper state g (0 open, 1 closed; between them where several plans are averaged,
+    not in demonstrations).
     ``times (T,)`` float64, strictly increasing within [0, 1].
 
     Raises `InvalidValueError` for other shapes, values that are not finite, gripper states outside [0, 1], or times

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,8 +14,8 @@ from robust_instant_policy.datasets import VideoWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import UnreachableError, UsageError
 from robust_instant_policy.evaluation import holds_results, obtain_demonstrations, scene_seed
-from robust_instant_policy.llm import connect
-from robust_instant_policy.policies import RobustInstantPolicy
+from robust_instant_policy.llm import DEADLINE_S, connect
+from robust_instant_policy.policies import RobustInstantPolicy, Settings
 from robust_instant_policy.reporting.run import (
     PLAN_FILE,
     SEEN_FILE,
@@ -51,12 +50,20 @@ def run(options: argparse.Namespace) -> int:
     if options.demos.isdecimal() and int(options.demos) == 0:
         raise UsageError("--demos 0: the task must be shown at least once")
     out = options.out or RUNS / f"{options.task}-{options.seed}"
-    run_demo(options.task, options.llm, options.seed, options.demos, out, DATA, method_settings(options))
+    settings = method_settings(options)
+    run_demo(options.task, options.llm, options.seed, options.demos, out, DATA, settings, options.deadline)
     return 0
 
 
 def run_demo(
-    task_name: str, llm_spec: str, seed: int, demonstrations: str, out: Path, data: Path, options: dict[str, Any]
+    task_name: str,
+    llm_spec: str,
+    seed: int,
+    demonstrations: str,
+    out: Path,
+    data: Path,
+    settings: Settings,
+    deadline_s: float = DEADLINE_S,
 ) -> RunRecord:
     """Record missing demonstrations, plan and execute; writes the run folder ``out``.
 
@@ -70,7 +77,7 @@ def run_demo(
     with screen.stage("simulator"):
         task = make_task(task_name)
     try:
-        return _run(task, llm_spec, scene, demonstrations, out, data, options, screen)
+        return _run(task, llm_spec, scene, demonstrations, out, data, settings, deadline_s, screen)
     finally:
         task.close()
 
@@ -82,14 +89,17 @@ def _run(
     demonstrations: str,
     out: Path,
     data: Path,
-    options: dict[str, Any],
+    settings: Settings,
+    deadline_s: float,
     screen: StageConsole,
 ) -> RunRecord:
     shown = _demonstrations(task, demonstrations, data, screen)
     with screen.stage(f"language model ({llm_spec})"):
         model = connect(llm_spec)
     try:
-        policy = RobustInstantPolicy(model, workspace=task.workspace, progress=screen.done_so_far, **options)
+        policy = RobustInstantPolicy(
+            model, settings, deadline_s=deadline_s, progress=screen.done_so_far, workspace=task.workspace
+        )
         with screen.stage("keypoints of the demonstrations"):
             policy.fit(shown)
         for note in policy.context_.notes:

@@ -8,7 +8,16 @@ from functools import partial
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole, TrainingScreen
-from robust_instant_policy.commands.options import CHECKPOINTS, DATA, add_assets, add_method, positive, seed
+from robust_instant_policy.commands.options import (
+    CHECKPOINTS,
+    add_assets,
+    add_level,
+    add_method,
+    data_folder,
+    method_settings,
+    positive,
+    seed,
+)
 from robust_instant_policy.evaluation import (
     STORE_FILE,
     Analysis,
@@ -23,6 +32,7 @@ from robust_instant_policy.evaluation import (
 )
 from robust_instant_policy.evaluation.cluster import RayWorkers
 from robust_instant_policy.evaluation.processes import LocalWorkers
+from robust_instant_policy.evaluation.scenes import SPLITS
 from robust_instant_policy.evaluation.store import EPISODES_FILE
 from robust_instant_policy.evaluation.work import Outcome, Workers
 from robust_instant_policy.llm import model_name
@@ -41,8 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--methods",
         nargs="+",
         metavar="METHOD",
-        help="of rip rip-gauss rip-adaptive kat dp kat-dp neighbours gp "
-        "(default: rip rip-gauss kat, or those of the suite)",
+        help="of rip rip-gauss mean rip-adaptive kat dp kat-dp neighbours gp "
+        "(default: rip rip-gauss mean kat, or those of the suite)",
     )
     parser.add_argument(
         "--demos", type=positive, default=10, metavar="N", help="demonstrations per task (default: %(default)s)"
@@ -58,10 +68,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--objects",
         choices=("seen", "unseen"),
-        default="seen",
-        help="objects of the test scenes: as demonstrated, or others",
+        help="objects of the test scenes: as demonstrated, or others (default: those of the level)",
     )
     add_assets(parser)
+    add_level(parser)
+    parser.add_argument(
+        "--sets",
+        type=positive,
+        default=1,
+        metavar="N",
+        help="run everything with N sets of demonstrations, each of other scenes (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--split",
+        choices=tuple(SPLITS),
+        default="test",
+        help="scenes: those of the reported tests, or those on which choices are made (default: %(default)s)",
+    )
     parser.add_argument("--steps", type=positive, metavar="N", help="training steps of dp and kat-dp (default: 1000)")
     parser.add_argument(
         "--checkpoints",
@@ -79,46 +102,66 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--keep", action="store_true", help="do not repeat what another version of the code has executed"
     )
     parser.add_argument("--no-videos", action="store_true", help="no videos of failed episodes")
+    parser.add_argument("--no-analysis", action="store_true", help="no causes and videos of failed episodes")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to continue")
     add_method(parser)
 
 
 def run(options: argparse.Namespace) -> int:
+    settings = method_settings(options)
     base = Variant(
         "rip",
         demos=options.demos,
         queries=options.queries,
-        downsampling=options.downsampling,
-        frames=options.frames,
-        layout=options.layout,
-        features=options.features,
+        downsampling=settings.downsampling,
+        frames=settings.frames,
+        layout=settings.layout,
+        features=settings.features,
         model=model_name(options.llm),
+        keypoints=settings.keypoints,
+        column=settings.column,
+        estimator=settings.estimator,
     )
     steps = options.steps or DEFAULT_STEPS
     choice = Choice(
-        base, options.tasks, options.methods, options.episodes, options.seed, options.objects, options.assets, steps
+        base,
+        options.tasks,
+        options.methods,
+        options.episodes,
+        options.seed,
+        options.objects,
+        options.assets,
+        options.level,
+        options.split,
+        steps,
     )
-    setup = Setup(
-        llm=options.llm,
-        replay=options.replay,
-        store=options.out / STORE_FILE,
-        data=DATA if options.assets == "code" else DATA / options.assets,
-        deadline_s=float(options.deadline),
-        films=not options.no_videos,
-        checkpoints=options.checkpoints,
-    )
+    setups = [
+        Setup(
+            llm=options.llm,
+            replay=options.replay,
+            store=options.out / STORE_FILE,
+            data=data_folder(options.assets, options.level, demo_set),
+            deadline_s=float(options.deadline),
+            films=not options.no_videos,
+            checkpoints=options.checkpoints,
+            demo_set=demo_set,
+            analyses=not options.no_analysis,
+        )
+        for demo_set in range(options.sets)
+    ]
     workers: Workers = (
         LocalWorkers(options.workers or 1) if options.ray is None else RayWorkers(options.ray, options.workers)
     )
     suites = make_suites(options.suite or ["chosen"], choice)
-    evaluate(suites, setup, options.out, workers, ["rip", *options.arguments], options.keep)
+    evaluate(suites, setups, options.out, workers, ["rip", *options.arguments], options.keep)
     return 0
 
 
 def evaluate(
-    suites: Sequence[Suite], setup: Setup, out: Path, workers: Workers, arguments: Sequence[str], keep: bool
+    suites: Sequence[Suite], setups: Sequence[Setup], out: Path, workers: Workers, arguments: Sequence[str], keep: bool
 ) -> None:
-    """Run what ``out`` lacks of ``suites`` with progress output, then write tables, figures and page."""
+    """Run what ``out`` lacks of ``suites`` with each set of demonstrations of ``setups`` and progress output, then
+    write tables, figures and page."""
     screen = StageConsole()
 
     def recording(task: str, there: int, count: int, thrown_away: int) -> None:
@@ -139,7 +182,9 @@ def evaluate(
         recording, outcome, TrainingScreen(screen), trained=partial(keep_training_picture, out), note=screen.say
     )
     with screen.stage("evaluation"):
-        run_suites(suites, setup, out, workers, progress, arguments, keep)
+        for setup in setups:
+            shown = [suite.with_demonstrations(setup.demo_set) for suite in suites]
+            run_suites(shown, setup, out, workers, progress, arguments, keep)
     screen.say("")
     screen.say(publish(out))
     screen.say(f"rows: {out / EPISODES_FILE}; page: {out / PAGE_FILE}")

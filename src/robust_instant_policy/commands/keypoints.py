@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import beside, positive, seed
+from robust_instant_policy.commands.options import add_level, beside, positive, seed
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.evaluation import scene_seed
@@ -18,6 +18,7 @@ from robust_instant_policy.perception.accuracy import Accuracy, measure
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
+from robust_instant_policy.tasks.level import PAPER
 
 NOISE_SEED = 1_000_000  # of the demonstrations' camera noise, apart from the scenes'
 Camera = Callable[[Observation, int], Observation]
@@ -29,18 +30,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=seed, default=0, help="seed of the first new scene (default: %(default)s)")
     parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
     parser.add_argument("--noise", action="store_true", help="add the noise of a stereo depth camera")
+    add_level(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR-keypoints.html)")
 
 
 def run(options: argparse.Namespace) -> int:
     out = options.out or beside(options.demos, "-keypoints.html")
-    show_keypoints(options.demos, options.features, options.scenes, options.noise, options.seed, out)
+    show_keypoints(options.demos, options.features, options.scenes, options.noise, options.seed, out, options.level)
     return 0
 
 
-def show_keypoints(demos: Path, features: str, num_scenes: int, noisy: bool, seed: int, out: Path) -> Path:
+def show_keypoints(
+    demos: Path, features: str, num_scenes: int, noisy: bool, seed: int, out: Path, level: str = PAPER.name
+) -> Path:
     """Write the page to ``out``. For a simulated task, also compare the keypoints of new scenes with the true positions
-    of the same material points. ``noisy`` adds the depth camera's noise to all images.
+    of the same material points; ``level`` is that of these scenes and of the demonstrations. ``noisy`` adds the depth
+    camera's noise to all images.
     """
     screen = StageConsole()
     demonstrations = load_demonstrations(demos)
@@ -52,7 +57,7 @@ def show_keypoints(demos: Path, features: str, num_scenes: int, noisy: bool, see
     scenes: list[Observation] = []
     accuracy = None
     if simulated:
-        task: Any = make_task(name)
+        task: Any = make_task(name, level=level)
         try:
             extractor = KeypointExtractor(features=features, workspace=task.workspace)
             with screen.stage(f"keypoints of {len(images)} demonstrations"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from robust_instant_policy.evaluation.merging import Share, merge
+from robust_instant_policy.evaluation.merging import merge
 from robust_instant_policy.reporting.publication import PAGE_FILE, publish
 
 
@@ -15,10 +15,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    def report(share: Share) -> None:
-        print(f"{share.folder}: {share.new} new executions, {share.known} already present", flush=True)
-
-    merge(options.runs, options.out, report)
+    for share in merge(options.runs, options.out):
+        print(f"{share.folder}: {share.new} new executions, {share.known} already present")
     publish(options.out)
     print(options.out / PAGE_FILE)
     return 0

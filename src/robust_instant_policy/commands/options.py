@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
+from robust_instant_policy.policies.settings import CONFIGS, WORDS, Settings
+from robust_instant_policy.tasks.level import LEVELS, PAPER
 from robust_instant_policy.tasks.task import bounded_seed
 
 DATA = Path("data")  # demonstrations, one folder per task
 RUNS = Path("runs")
 CHECKPOINTS = Path("checkpoints")
-SEED_BITS = 62  # seeds, and those counted up from them, stand in tables of 64-bit integers
 
 
 def natural(text: str) -> int:
@@ -23,7 +23,7 @@ def natural(text: str) -> int:
 
 def seed(text: str) -> int:
     """A whole number, 0 or more; one that is too large for simulators and tables is mapped to a smaller one."""
-    return bounded_seed(natural(text), SEED_BITS)
+    return bounded_seed(natural(text))
 
 
 def positive(text: str) -> int:
@@ -42,27 +42,39 @@ def add_assets(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_level(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--level",
+        choices=tuple(LEVELS),
+        default=PAPER.name,
+        help="difficulty of the scenes: as in the paper, or with camera noise, rotated objects, distractors, "
+        "other tables and light, hidden parts and start poses (default: %(default)s)",
+    )
+
+
+def data_folder(assets: str, level: str, demo_set: int = 0) -> Path:
+    """Where demonstrations with these objects at this level are kept, those of one set apart from those of others."""
+    unusual = [value for value, usual in ((assets, "code"), (level, PAPER.name)) if value != usual]
+    return DATA.joinpath(*unusual, *([f"set-{demo_set}"] if demo_set else []))
+
+
 def add_method(parser: argparse.ArgumentParser) -> None:
-    """Add the settings of the method; `method_settings` reads them."""
+    """Add the settings of the method; `method_settings` and `deadline` read them."""
     parser.add_argument(
-        "--frames",
-        choices=("adaptive", "world"),
+        "--config",
+        choices=tuple(CONFIGS),
         default="adaptive",
-        help="frames of the prompt; world: as in the paper (default: %(default)s)",
+        help="paper, paper-real: as in the paper, with a column of its Table II; the settings below change parts of it "
+        "(default: %(default)s)",
     )
-    parser.add_argument(
-        "--layout",
-        choices=("factorised", "sequence"),
-        default="factorised",
-        help="layout of the prompt; sequence: as in the paper (default: %(default)s)",
-    )
-    parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
-    parser.add_argument(
-        "--downsampling",
-        choices=("masked", "uniform"),
-        default="masked",
-        help="masked keeps gripper changes (default: %(default)s)",
-    )
+    add_keypoints(parser)
+    for name, words in (
+        ("frames", "frames of the prompt"),
+        ("layout", "layout of the prompt"),
+        ("downsampling", "masked keeps gripper changes"),
+        ("estimator", "regression; em-number: the model of the paper's networks, fitted exactly"),
+    ):
+        parser.add_argument(f"--{name}", choices=WORDS[name], help=f"{words} (default: that of --config)")
     parser.add_argument(
         "--deadline",
         type=positive,
@@ -72,9 +84,21 @@ def add_method(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def method_settings(options: argparse.Namespace) -> dict[str, Any]:
-    settings = {name: getattr(options, name) for name in ("frames", "layout", "features", "downsampling")}
-    return {**settings, "deadline_s": float(options.deadline)}
+def add_keypoints(parser: argparse.ArgumentParser) -> None:
+    """Add the settings of the keypoints."""
+    parser.add_argument("--features", help="image descriptors (default: auto, or dino with --config paper)")
+    parser.add_argument(
+        "--keypoints",
+        choices=WORDS["keypoints"],
+        help="keypoints by registration of objects, or by nearest descriptors as in the paper",
+    )
+
+
+def method_settings(options: argparse.Namespace) -> Settings:
+    """Those of ``--config``, and what was given beside it."""
+    names = ("features", "keypoints", "frames", "layout", "downsampling", "estimator")
+    given = {name: getattr(options, name) for name in names}
+    return Settings.of(options.config).changed(**{name: value for name, value in given.items() if value is not None})
 
 
 def beside(folder: Path, ending: str) -> Path:

@@ -34,7 +34,11 @@ def run(options: argparse.Namespace) -> int:
         model = connect(options.llm)
     try:
         policy = RobustInstantPolicy(
-            model, num_queries=options.queries, progress=screen.done_so_far, **method_settings(options)
+            model,
+            method_settings(options),
+            num_queries=options.queries,
+            deadline_s=options.deadline,
+            progress=screen.done_so_far,
         )
         with screen.stage("keypoints of the demonstrations"):
             policy.fit(demonstrations)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import add_assets, positive, seed
+from robust_instant_policy.commands.options import add_assets, add_level, positive, seed
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.sanity import check_demonstrations
 from robust_instant_policy.tasks import make_task
@@ -24,12 +24,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--every", type=positive, default=1, metavar="N", help="keep every N-th step: 5 reduces 55 Hz to 11 Hz"
     )
     add_assets(parser)
+    add_level(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder, or one to continue")
 
 
 def run(options: argparse.Namespace) -> int:
     screen = StageConsole()
-    task = make_task(options.task, assets=options.assets)
+    task = make_task(options.task, assets=options.assets, level=options.level)
     try:
         with (
             screen.stage(f"{options.episodes} demonstrations"),

@@ -20,6 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     if not options.file.exists():
         raise UsageError(f"no stored answers at {options.file}; rip eval --out DIR keeps them in DIR/samples.sqlite")
+    if options.file.is_file() and options.file.stat().st_size == 0:  # SQLite would make a database of it
+        raise UsageError(f"{options.file} is empty; rip eval --out DIR keeps answers in DIR/samples.sqlite")
     store = SampleStore(options.file)
     try:
         if options.export:

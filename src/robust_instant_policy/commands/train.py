@@ -12,6 +12,7 @@ from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.perception.network import resolve_features
 from robust_instant_policy.policies import TRAINED_METHODS, Settings, make_trained_policy
 from robust_instant_policy.policies.training import DEFAULT_STEPS, Training
 from robust_instant_policy.reporting.training import training_picture
@@ -52,9 +53,9 @@ def train(task: str, method: str, demos: Path, limit: int | None, training: Trai
         raise UnknownNameError("trained method", method, TRAINED_METHODS)
     screen = StageConsole()
     demonstrations = load_demonstrations(demos, task=task, limit=limit)
-    policy = make_trained_policy(
-        method, Settings().changed(workspace=_workspace(task)), replace(training, report=TrainingScreen(screen))
-    )
+    # The resolved network, as `rip eval` does: it is part of the name of the checkpoint.
+    settings = Settings(features=resolve_features("auto")).changed(workspace=_workspace(task))
+    policy = make_trained_policy(method, settings, replace(training, report=TrainingScreen(screen)))
     with screen.stage(f"{method} on {len(demonstrations)} demonstrations"):
         policy.fit(demonstrations)
     trained = policy.trained_

@@ -288,7 +288,7 @@ def _is_whole(value: object, least: int = 0) -> bool:
 
 
 def _read_episodes(root: Path, count: int) -> list[dict[str, Any]]:
-    """The first ``count`` rows; later ones were not finished when their writer was killed."""
+    """The first ``count`` rows; one more was not finished when its writer was killed."""
     rows: list[dict[str, Any]] = []
     for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
         table = read_table(inside(root, path.relative_to(root)), skip=STATISTICS_PREFIX)
@@ -296,8 +296,10 @@ def _read_episodes(root: Path, count: int) -> list[dict[str, Any]]:
             rows += table.to_pylist()
         except (ValueError, OverflowError, pa.ArrowException) as error:
             raise DatasetError(f"{path} is damaged ({excerpt(error)}); {REPAIR}") from None
-        if len(rows) >= count:
-            break
+        if len(rows) > count + 1:
+            raise DatasetError(
+                f"{root} is damaged: {layout.INFO_PATH} counts {count} episodes, meta/episodes lists more; {REPAIR}"
+            )
     if len(rows) < count or [row.get("episode_index") for row in rows[:count]] != list(range(count)):
         raise DatasetError(
             f"{root} is damaged: meta/episodes lists {len(rows)} of {count} episodes, or out of order; "

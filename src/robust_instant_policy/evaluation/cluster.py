@@ -1,7 +1,7 @@
-"""Workers on a Ray cluster: any number of machines, of which any may go away while they work.
+"""Workers on a Ray cluster: any number of machines, any of which may fail.
 
-Nothing needs a shared disk. Demonstrations travel to the workers once; samples are read and written through one actor
-beside the rows, on the machine where the command runs; outcomes come back one by one.
+No shared disk is needed. Each worker gets the demonstrations once. One actor, on the machine where the command runs,
+reads and writes the samples. Outcomes are streamed back one by one.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from robust_instant_policy.evaluation.workers import ONE_THREAD, Died, Finished,
 from robust_instant_policy.llm import SampleStore
 
 CORES_A_WORKER = 1
-LOOK_SECONDS = 2.0  # between two looks at whether a worker can be had by now
+POLL_SECONDS = 2.0  # between two checks for free cores
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class RayWorkers:
     count: int | None = None
 
     def __call__(self, setup: Setup, works: list[SceneWork]) -> Iterator[Outcome]:
-        """Do ``works``; a machine that is lost is a death of its workers.
+        """Do ``works``; the loss of a machine counts as the death of its workers.
 
-        Raises `MissingExtraError` without Ray, and `UsageError` where there is no cluster at the address.
+        Raises `MissingExtraError` without Ray, and `UsageError` if there is no cluster at the address.
         """
         try:
             import ray
@@ -54,10 +54,10 @@ class RayWorkers:
 
 @dataclass(eq=False, kw_only=True)
 class _Member(Worker):
-    """An actor, and the stream of what comes of the scene that it was given."""
+    """An actor, and the stream of outcomes of its current scene."""
 
     actor: Any
-    said: Any = None
+    stream: Any = None
 
 
 class _Actors:
@@ -88,17 +88,17 @@ class _Actors:
         return self._members
 
     def give(self, worker: _Member, work: SceneWork) -> None:
-        worker.said = worker.actor.run.options(num_returns="streaming").remote(work)
+        worker.stream = worker.actor.run.options(num_returns="streaming").remote(work)
 
     def receive(self, busy: Collection[_Member]) -> Iterator[tuple[_Member, Message]]:
         import ray
         from ray.exceptions import RayActorError
 
-        by_stream = {worker.said: worker for worker in busy}
-        if not by_stream:  # no machine has room
-            time.sleep(LOOK_SECONDS)
+        by_stream = {worker.stream: worker for worker in busy}
+        if not by_stream:  # no machine has a free core
+            time.sleep(POLL_SECONDS)
             return
-        ready, _ = ray.wait(list(by_stream), timeout=LOOK_SECONDS)
+        ready, _ = ray.wait(list(by_stream), timeout=POLL_SECONDS)
         for stream in ready:
             worker = by_stream[stream]
             try:
@@ -112,18 +112,18 @@ class _Actors:
                 yield worker, message
 
     def close(self) -> None:
-        """Nothing: Ray ends the actors of a driver that leaves."""
+        """Does nothing: Ray ends the actors when the driver disconnects."""
 
 
 class _Actor:
-    """A worker: a workbench that lives in a Ray actor."""
+    """A worker: a workbench in a Ray actor."""
 
     def __init__(self, setup: Setup, store: Any, shown: dict[str, Any]):
         self._shown = shown
         self._bench = Workbench(setup, cast(SampleStore, _DistantStore(store, setup.store)), self._demonstrations)
 
     def run(self, work: SceneWork) -> Iterator[Outcome | WorkError]:
-        """Each outcome of ``work`` as it comes, and the error that ended it early, if one did."""
+        """Yields each outcome of ``work``, and the error that ended it early, if any."""
         try:
             yield from self._bench.run(work)
         except Exception as error:
@@ -136,7 +136,7 @@ class _Actor:
 
 
 class _DistantStore:
-    """A `SampleStore` that is a Ray actor, perhaps on another machine: whatever is asked of it is asked there."""
+    """Proxy of a `SampleStore` in a Ray actor: forwards each method call to it."""
 
     def __init__(self, actor: Any, path: Path):
         self._actor, self.path = actor, path

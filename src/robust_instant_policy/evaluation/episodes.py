@@ -1,4 +1,4 @@
-"""One row of the results: an execution."""
+"""A row of the results: one execution."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ EpisodeKey = tuple[Scene, Variant, int]
 class Episode:
     """One execution of one trajectory that ``variant`` planned in ``scene``.
 
-    ``candidate`` numbers the ``candidates`` executions of one plan (0 of 1 where there is one); ``seconds`` is the
-    wall time of planning, ``physics_seconds`` that of the execution, ``executed_seconds`` the time the robot moved;
-    ``tokens`` counts those read and written; ``confidence`` is the plan's; ``failure`` says in words what went wrong
-    and is empty on success.
+    ``candidate`` is the index of the execution among the ``candidates`` executions of its plan. ``seconds`` is the wall
+    time of planning, ``physics_seconds`` that of the simulation, ``executed_seconds`` the time the robot moved.
+    ``tokens`` were read and written; ``confidence`` is the plan's. ``failure`` is the reason, empty on success.
     """
 
     scene: Scene

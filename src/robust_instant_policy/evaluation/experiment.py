@@ -1,20 +1,19 @@
-"""Experiments: suites of variants in scenes, done by workers, kept row by row, resumable at any moment."""
+"""Run suites of variants in scenes with a pool of workers; each row is stored at once, so a run can be resumed."""
 
 from __future__ import annotations
 
 import os
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from robust_instant_policy.datasets import layout
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey, Trial
+from robust_instant_policy.evaluation.episodes import Episode, Trial
 from robust_instant_policy.evaluation.failures import Failure, video_file
 from robust_instant_policy.evaluation.manifest import code_digest
 from robust_instant_policy.evaluation.scenes import (
@@ -47,9 +46,9 @@ def ignore(*_: object) -> None:
 
 @dataclass(frozen=True)
 class Progress:
-    """Called as the run goes on: ``recording(task, there, wanted, thrown away)``, ``outcome(trials done, trials wanted,
-    what has just come, or None at the start)``, ``training`` while a method is trained, ``trained(task, variant,
-    policy)`` when that is done, and ``note`` with a line that the user should read.
+    """Callbacks: ``recording(task, episodes stored, episodes wanted, attempts discarded)``, ``outcome(plans done, plans
+    wanted, the new outcome, or None at the start)``, ``training`` while a method is trained, ``trained(task, variant,
+    policy)`` after that, and ``note`` with a line for the user.
     """
 
     recording: Callable[[str, int, int, int], None] = ignore
@@ -68,12 +67,11 @@ def run_suites(
     arguments: Sequence[str] = ("(called from Python)",),
     keep: bool = False,
 ) -> None:
-    """Run what is missing of ``suites`` in ``out``: executions, and the analysis of those that failed.
+    """Run what is missing of ``suites`` in ``out``: executions, and the analysis of failed ones.
 
-    Demonstrations are kept in ``setup.data/TASK`` and recorded where they are missing. What several suites ask for is
-    done once, and everything in one scene together, so that its samples are asked for once. Rows of another version of
-    the code are not counted as done unless ``keep``; rows with other demonstrations never are. ``arguments`` are the
-    words of the command, noted in the manifest.
+    Missing demonstrations are recorded in ``setup.data/TASK``. Plans that several suites contain are made once, and all
+    plans of a scene together, so that they share samples. Rows of another version of the code do not count as done
+    unless ``keep``; rows with other demonstrations never do. The manifest stores ``arguments``, the command line.
     """
     suites = [identified(suite, setup) for suite in suites]
     make_folder(out)
@@ -82,30 +80,31 @@ def run_suites(
         closing(ResultsStore(out)) as store,
         store.invocation(suites, arguments, model_name(setup.llm)),
     ):
-        episodes = store.results().episodes
-        trials = _with_demonstrations(wanted_trials(suites), episodes, setup, progress, keep)
-        left = executions_left(episodes)
+        results = store.results()
+        executed = by_trial(results.episodes)
+        trials = _with_demonstrations(wanted_trials(suites), executed, setup, progress, keep)
         if keep:
-            complete = {_of_any_code(trial) for trial, count in left.items() if count == 0}
-            trials = [trial for trial in trials if trial in left or _of_any_code(trial) not in complete]
-        if repeated := _superseded(trials, episodes):
+            complete = {_apart_from("code", trial) for trial, rows in executed.items() if is_complete(rows)}
+            trials = [trial for trial in trials if trial in executed or _apart_from("code", trial) not in complete]
+        if repeated := _superseded(trials, executed):
             progress.note(
                 f"{repeated} plans were executed with other code, demonstrations, features or deadline; these rows "
                 "stay apart, and the plans are executed again (--keep leaves out what only the code tells apart)"
             )
-        done = sum(left.get(trial) == 0 for trial in trials)
+        done = sum(is_complete(executed.get(trial, ())) for trial in trials)
         progress.outcome(done, len(trials), None)
         drawn = set(wanted_trials(suite for suite in suites if suite.keeps_plans))
-        kept = [trial for trial in trials if _of_any_demonstrations(trial) in drawn]
-        works = missing_work(trials, kept, episodes, store.results().failures, out, setup.films)
+        kept = {trial for trial in trials if _apart_from("demonstrations", trial) in drawn}
+        works = missing_work(trials, kept, executed, results.failures, out, setup.films, setup.analyses)
         if not works:
             return
         _train_missing(works, setup, progress)
         for outcome in workers(setup, works):
             if isinstance(outcome, Episode):
                 store.add(outcome)
-                left[outcome.trial] = left.get(outcome.trial, outcome.candidates) - 1
-                done += left[outcome.trial] == 0
+                rows = executed.setdefault(outcome.trial, [])
+                rows.append(outcome)
+                done += is_complete(rows)
             elif isinstance(outcome, Planned):
                 path = out / plan_file(outcome.scene, outcome.variant)
                 path.parent.mkdir(exist_ok=True)
@@ -120,8 +119,8 @@ def run_suites(
 
 @contextmanager
 def one_writer(out: Path) -> Iterator[None]:
-    """Keep other processes from writing into the run's folder ``out``; `DatasetError` when one does, and for a folder
-    of demonstrations."""
+    """Lock the run's folder ``out``. Raises `DatasetError` if another process writes to it, or if it holds
+    demonstrations."""
     if (out / layout.RIP_PATH).exists() or (out / layout.INFO_PATH).exists():
         raise DatasetError(f"{out} holds demonstrations; give a folder of its own for the results")
     descriptor = lock_folder(out)
@@ -132,14 +131,14 @@ def one_writer(out: Path) -> Iterator[None]:
 
 
 def identified(suite: Suite, setup: Setup) -> Suite:
-    """``suite`` with all that decides its rows but the demonstrations: network, code, deadline."""
+    """``suite`` with the keys of its rows filled in, except the demonstrations: network, code, deadline."""
     decided = partial(replace, code=code_digest(), deadline_s=setup.deadline_s)
     variants = (decided(variant, features=resolve_features(variant.features)) for variant in suite.variants)
     return replace(suite, variants=tuple(variants))
 
 
 def wanted_trials(suites: Iterable[Suite]) -> list[Trial]:
-    """Every plan that ``suites`` ask for, once, those of one scene together."""
+    """The plans of all ``suites``, each once, ordered by scene."""
     by_scene: dict[Scene, dict[Variant, None]] = {}
     for suite in suites:
         for scene in suite.scenes:
@@ -147,94 +146,87 @@ def wanted_trials(suites: Iterable[Suite]) -> list[Trial]:
     return [(scene, variant) for scene, variants in by_scene.items() for variant in variants]
 
 
-def executions_left(rows: Iterable[Episode]) -> dict[Trial, int]:
-    """How many executions the plans that were begun still lack."""
-    left: dict[Trial, int] = {}
+def by_trial(rows: Iterable[Episode]) -> dict[Trial, list[Episode]]:
+    """The executions of each plan."""
+    executed: dict[Trial, list[Episode]] = {}
     for row in rows:
-        left[row.trial] = left.get(row.trial, row.candidates) - 1
-    return left
+        executed.setdefault(row.trial, []).append(row)
+    return executed
+
+
+def is_complete(rows: Sequence[Episode]) -> bool:
+    """Whether ``rows`` are all executions of their plan."""
+    return bool(rows) and len(rows) == rows[0].candidates
 
 
 def plan_file(scene: Scene, variant: Variant) -> str:
-    """Where, in a run's folder, a plan is kept that is to be drawn."""
+    """Path in a run's folder of a plan that is stored for a figure."""
     return f"{PLAN_FOLDER}/{scene}-{variant.file_name}.json"
 
 
 def training_file(task: str, variant: Variant) -> str:
-    """Where, in a run's folder, a picture is kept of how a method learned ``task``."""
+    """Path in a run's folder of the figure about the training of ``variant`` on ``task``."""
     return f"{TRAINING_FOLDER}/{task}-{variant.file_name}.svg"
 
 
 def missing_work(
-    wanted: Sequence[Trial],
-    kept: Sequence[Trial],
-    rows: Sequence[Episode],
-    failures: Sequence[Failure],
+    trials: Iterable[Trial],
+    kept: Collection[Trial],
+    executed: Mapping[Trial, Sequence[Episode]],
+    failures: Iterable[Failure],
     out: Path,
     films: bool,
+    analyses: bool = True,
 ) -> list[SceneWork]:
-    """What is still to be done for the ``wanted`` plans, of which those ``kept`` go into files, scene by scene."""
-    left = executions_left(rows)
-    examined = {row.key for row in failures}
-    todo: defaultdict[Scene, list[Variant]] = defaultdict(list)
-    plans: defaultdict[Scene, list[Variant]] = defaultdict(list)
-    done: defaultdict[Scene, set[EpisodeKey]] = defaultdict(set)
-    failed: defaultdict[Scene, list[Episode]] = defaultdict(list)
-    for scene, variant in wanted:
-        if left.get((scene, variant)) != 0:
-            todo[scene].append(variant)
-    among = set(wanted)
-    for row in rows:
-        if row.trial in among:
-            done[row.scene].add(row.key)
-            filmed = not films or row.executed_seconds == 0 or (out / video_file(*row.key)).exists()
-            if not row.success and not (row.key in examined and filmed):
-                failed[row.scene].append(row)
-    for scene, variant in kept:
-        if not (out / plan_file(scene, variant)).exists():
-            plans[scene].append(variant)
-    return [
-        SceneWork(scene, tuple(todo[scene]), frozenset(done[scene]), tuple(failed[scene]), tuple(plans[scene]))
-        for scene in dict.fromkeys(scene for scene, _ in wanted)
-        if todo[scene] or failed[scene] or plans[scene]
-    ]
+    """The missing work for ``trials``, one value a scene. The plans of the trials in ``kept`` are stored in files."""
+    examined = {failure.key for failure in failures}
+
+    def is_analysed(row: Episode) -> bool:
+        filmed = not films or row.executed_seconds == 0 or (out / video_file(*row.key)).exists()
+        return row.key in examined and filmed
+
+    works: dict[Scene, SceneWork] = {}
+    for scene, variant in trials:
+        rows = executed.get((scene, variant), ())
+        planned = (scene, variant) not in kept or (out / plan_file(scene, variant)).exists()
+        work = works.get(scene, SceneWork(scene))
+        works[scene] = SceneWork(
+            scene,
+            work.variants if is_complete(rows) else (*work.variants, variant),
+            work.done.union(row.key for row in rows),
+            (*work.failed, *(row for row in rows if analyses and not row.success and not is_analysed(row))),
+            work.plans if planned else (*work.plans, variant),
+        )
+    return [work for work in works.values() if work.concerned]
 
 
-def _of_any_code(trial: Trial) -> Trial:
+def _apart_from(settings: str, trial: Trial) -> Trial:
+    """``trial`` without the ``settings`` of its variant (names separated by spaces)."""
     scene, variant = trial
-    return scene, replace(variant, code="")
+    empty: dict[str, Any] = dict.fromkeys(settings.split())
+    return scene, replace(variant, **empty)
 
 
-def _of_any_demonstrations(trial: Trial) -> Trial:
-    scene, variant = trial
-    return scene, replace(variant, demonstrations="")
-
-
-def _superseded(trials: Sequence[Trial], rows: Sequence[Episode]) -> int:
-    """How many of ``trials`` lack executions, but have some that differ only in settings that no user chose."""
-
-    def chosen(trial: Trial) -> Trial:
-        scene, variant = trial
-        return scene, replace(variant, code="", demonstrations="", features="", deadline_s=None)
-
-    own = {row.trial for row in rows}
-    begun = {chosen(trial) for trial in own}
-    return sum(trial not in own and chosen(trial) in begun for trial in trials)
+def _superseded(trials: Iterable[Trial], executed: Collection[Trial]) -> int:
+    """Number of ``trials`` without executions for which there are executions with other code, demonstrations, …"""
+    chosen = partial(_apart_from, "code demonstrations features deadline_s")
+    begun = set(map(chosen, executed))
+    return sum(trial not in executed and chosen(trial) in begun for trial in trials)
 
 
 def _with_demonstrations(
-    trials: Sequence[Trial], rows: Sequence[Episode], setup: Setup, progress: Progress, keep: bool
+    trials: Sequence[Trial],
+    executed: Mapping[Trial, Sequence[Episode]],
+    setup: Setup,
+    progress: Progress,
+    keep: bool,
 ) -> list[Trial]:
-    """``trials`` with the digest of the demonstrations that they are shown, which are recorded where they are missing.
+    """``trials`` with the digest of their demonstrations. Missing demonstrations are recorded.
 
-    Where a task's demonstrations are not at hand, and nothing that is wanted of it lacks executions, those that the
-    rows tell of are taken.
+    If demonstrations of a task are missing but all its executions are there, the digests of these rows are used.
     """
-
-    def plain(trial: Trial) -> Trial:
-        return _of_any_demonstrations(_of_any_code(trial) if keep else trial)
-
-    done = {plain(trial): trial[1].demonstrations for trial, left in executions_left(rows).items() if left == 0}
+    plain = partial(_apart_from, "code demonstrations" if keep else "demonstrations")
+    done = {plain(trial): trial[1].demonstrations for trial, rows in executed.items() if is_complete(rows)}
     most: dict[tuple[str, bool], int] = {}
     for scene, variant in trials:
         for with_images in {False, variant.method in IMAGE_METHODS}:
@@ -245,7 +237,7 @@ def _with_demonstrations(
         shown = stored_demonstrations(folder, task, count)
         of_task = [trial for trial in trials if trial[0].task == task]
         if len(shown) < count and not all(plain(trial) in done for trial in of_task):
-            shown = _record(task, of_task[0][0].assets, folder, count, with_images, progress)
+            shown = _record(of_task[0][0], setup.demo_set, folder, count, with_images, progress)
         digests[task, with_images] = demonstration_digests(shown)
 
     def digest(trial: Trial) -> str:
@@ -257,19 +249,18 @@ def _with_demonstrations(
 
 
 def _record(
-    name: str, assets: str, folder: Path, count: int, with_images: bool, progress: Progress
+    scene: Scene, demo_set: int, folder: Path, count: int, with_images: bool, progress: Progress
 ) -> list[Demonstration]:
-    task = make_task(name, assets=assets)
+    task = make_task(scene.task, assets=scene.assets, level=scene.level)
+    report = partial(progress.recording, scene.task)
     try:
-        return obtain_demonstrations(
-            task, folder, count, lambda *so_far: progress.recording(name, *so_far), with_images
-        )
+        return obtain_demonstrations(task, folder, count, report, with_images, demo_set)
     finally:
         task.close()
 
 
 def _train_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:
-    """Have checkpoints of everything that is trained, before workers would all train it at once."""
+    """Train all methods that need it, before the workers start: each of them would train."""
     trained: dict[tuple[str, Variant], SceneWork] = {}
     for work in works:
         for variant in work.concerned:

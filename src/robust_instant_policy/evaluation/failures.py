@@ -36,7 +36,7 @@ STAGES = ("keypoints", "samples", "regression", "execution", "policy")
 
 @dataclass(frozen=True)
 class Failure:
-    """The ``stage`` that a failed episode is due to, and what was found on the way; None where it was not checked.
+    """The ``stage`` to which a failed episode is attributed, and the results of the checks; None: not checked.
 
     ``demonstrator`` says whether the demonstrator's trajectory succeeds when played back, ``true_keypoints`` whether
     the method succeeds with the true keypoints, ``good_candidate`` whether one of the candidates that were aggregated
@@ -58,13 +58,13 @@ class Failure:
 
 
 def video_file(scene: Scene, variant: Variant, candidate: int) -> str:
-    """Where, in a run's folder, the video of an episode is kept."""
+    """Path in a run's folder of the video of an episode."""
     return f"{VIDEO_FOLDER}/{scene}-{variant.file_name}-{candidate}.mp4"
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The true keypoints of a scene; where a keypoint lies on nothing that moves, the one that was found.
+    """The true keypoints of a scene; for keypoints on the background, the located ones.
 
     ``error`` is the largest distance, in metres, between a keypoint found on an object and the truth.
     """
@@ -74,10 +74,12 @@ class Truth:
 
 
 def true_keypoints(task: Task, seed: int, context: Context, shown_truth: Sequence[KnownScene]) -> Truth | None:
-    """Where the keypoints of ``context`` are in the scene of ``seed``; None where it cannot say.
+    """The true keypoints of ``context`` in the scene of ``seed``; None if they cannot be computed.
 
     ``shown_truth`` is the simulator's knowledge of the demonstrations' own scenes.
     """
+    if context.extractor is None:  # the keypoints were given
+        return None
     observation = task.reset(seed)
     images = [demonstration.observation for demonstration in context.demonstrations]
     try:
@@ -92,7 +94,7 @@ def true_keypoints(task: Task, seed: int, context: Context, shown_truth: Sequenc
 
 
 class FailureAnalysis:
-    """Analyses the failed episodes of one scene; what several of them need is tried only once."""
+    """Analyses the failed episodes of one scene; checks that they share are made once."""
 
     def __init__(self, task: Task, scene: Scene):
         self._task, self._scene = task, scene
@@ -150,7 +152,7 @@ class FailureAnalysis:
 
 
 def film(task: Task, policy: ScenePolicy | ClosedLoopPolicy, observation: Observation, candidate: int) -> bytes:
-    """The episode once more, in the task's scene, as an MP4; empty where nothing moved."""
+    """Executes the episode again in the task's scene; returns an MP4, empty if nothing moved."""
     encoder = VideoEncoder(task.video_hz, FILM_OPTIONS)
     sink: FrameSink = encoder.add
     if isinstance(policy, ClosedLoopPolicy):

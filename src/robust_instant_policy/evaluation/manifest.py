@@ -1,4 +1,4 @@
-"""Which suites a run's folder holds, and by which commands, with which code and where it was made. No secrets."""
+"""The suites of a run's folder, and the commands, code and machines that produced it."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from robust_instant_policy.files import read_regular, write_whole
 MANIFEST_FILE = "run.json"
 GIB = 2**30
 PACKAGE = Path(__file__).parents[1]
-# What is in these rooms and files shows, serves or stores; everything else in the package decides results.
+# These rooms and files do not decide results; everything else in the package does.
 NOT_DECIDING = ("commands", "reporting", "serving", "robots", "evaluation", "cli.py", "errors.py", "files.py")
 DECIDING = ("evaluation/rollout.py", "evaluation/workbench.py")
 
 
 @dataclass(frozen=True)
 class Invocation:
-    """One command that added to a folder: when it began (UTC), how long it worked, on what and with which code."""
+    """One command that added rows to a folder: its start (UTC), duration, machine, code and model."""
 
     command: str
     began: str
@@ -38,14 +38,14 @@ class Invocation:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Suites, of which those of one name and the same objects are one, and the commands, oldest first."""
+    """Suites, one for each name and set of objects, and commands, oldest first."""
 
     suites: tuple[Suite, ...] = ()
     invocations: tuple[Invocation, ...] = ()
 
     @classmethod
     def read(cls, path: Path) -> Manifest:
-        """Of a ``run.json``; empty where there is none. Raises `DatasetError` for a damaged file."""
+        """Read a ``run.json``; empty if it does not exist. Raises `DatasetError` for a damaged file."""
         if not path.exists():
             return cls()
         try:

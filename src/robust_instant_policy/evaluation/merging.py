@@ -1,8 +1,8 @@
-"""Several runs as one: the parts of a job that was spread by hand, or methods that were run apart."""
+"""Merge runs: parts of a job that ran on several machines, or methods that were run separately."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,20 +18,20 @@ from robust_instant_policy.llm import SampleStore
 
 @dataclass(frozen=True)
 class Share:
-    """What came from one ``folder``: executions that are new, and those that were there already."""
+    """Number of executions of one ``folder`` that were ``new`` in the merged run, and that were ``known``."""
 
     folder: Path
     new: int
     known: int
 
 
-def merge(folders: Sequence[Path], out: Path, report: Callable[[Share], None] = lambda share: None) -> list[Share]:
-    """Bring the rows, samples, films, plans and commands of the runs in ``folders`` into the run in ``out``.
+def merge(folders: Sequence[Path], out: Path) -> list[Share]:
+    """Copy rows, samples, videos, plans and commands of the runs in ``folders`` into the run in ``out``.
 
-    ``out`` is made where there is none. What two of them did counts once: as ``out`` has it, else the first of
-    ``folders``. Nothing of theirs is changed, and one that is still being run may be read. What was merged once is
-    known the next time, so that a merge that was stopped is made whole by the same again. Raises `DatasetError` for a
-    folder without executions, or that cannot be read, before anything is written.
+    ``out`` is created if it is missing. An execution that occurs several times counts once: that of ``out``, else that
+    of the first folder. The folders are not changed; a run that is still in progress can be read. After an interruption
+    the same call completes the merge. Raises `DatasetError`, before anything is written, for a folder that has no
+    executions or cannot be read.
     """
     if out.resolve() in [folder.resolve() for folder in folders]:
         raise UsageError(f"{out} is itself one of the runs; leave it out of them, or give a new folder")
@@ -41,7 +41,7 @@ def merge(folders: Sequence[Path], out: Path, report: Callable[[Share], None] = 
     with one_writer(out), closing(ResultsStore(out)) as store:
         for folder, run in runs:
             known = {row.key: row for row in store.results().episodes}
-            # of an execution that out has from elsewhere, nothing is taken
+            # a row of out wins, with its video and failure analysis
             own = {row.key for row in run.episodes if known.get(row.key, row) == row}
             for name in (*_pictures(folder), *(video_file(*key) for key in own)):
                 if (folder / name).exists() and not (out / name).exists():
@@ -50,11 +50,10 @@ def merge(folders: Sequence[Path], out: Path, report: Callable[[Share], None] = 
                 with closing(SampleStore(out / STORE_FILE)) as samples:
                     samples.take(folder / STORE_FILE)
             store.note(run.manifest)
-            # last: a row says that all that belongs to it is there
+            # last: a row implies that its files are complete
             store.add(*(failure for failure in run.failures if failure.key in own), *run.episodes)
             new = len({row.key for row in run.episodes} - known.keys())
             shares.append(Share(folder, new, len(run.episodes) - new))
-            report(shares[-1])
         store.export()
     return shares
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from robust_instant_policy.evaluation.variant import PAPER_CONFIGS, Variant
+
 # Table I: success rates with 10 demonstrations and GPT-4o.
 TABLE1_TASKS = (
     "pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet",
@@ -16,6 +20,19 @@ TABLE1 = {
 }
 # Sec. V-B.2, over the five tasks with gripper actions: normal and gripper-based downsampling.
 DOWNSAMPLING = {"uniform": 52, "masked": 74}
+
+
+def is_told(variants: Sequence[Variant]) -> bool:
+    """Whether the paper's numbers may stand beside those of ``variants``: some are in the paper's configuration."""
+    return any(variant.config in PAPER_CONFIGS for variant in variants)
+
+
+def told(variant: Variant, task: str, beside: Sequence[Variant]) -> int | None:
+    """The paper's success rate in percent for a ``variant`` in its configuration, or of a method (such as dp) that
+    stands ``beside`` ones in it and is the same in all; else None.
+    """
+    own = [variant] if variant.config else beside
+    return table1(variant.method, task) if is_told(own) else None
 
 
 def table1(method: str, task: str) -> int | None:

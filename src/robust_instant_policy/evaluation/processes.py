@@ -1,6 +1,6 @@
-"""Workers on this machine: processes of their own, so that nothing that happens to one of them ends the run.
+"""Worker processes on this machine: the death of one does not end the run.
 
-A local Ray takes 10 s to start, processes 0.3 s: hence two kinds of pools.
+A local Ray takes 10 s to start, processes 0.3 s; hence two kinds of pools.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from robust_instant_policy.evaluation.work import Outcome, SceneWork, Setup
 from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.evaluation.workers import ONE_THREAD, Died, Finished, Message, Worker, WorkError, run_pool
 
-EXIT_SECONDS = 5.0  # that a worker gets to end by itself
+EXIT_SECONDS = 5.0  # before a worker that does not end is killed
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
 
 
@@ -99,7 +99,7 @@ class _Processes:
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """Processes started meanwhile compute with one thread."""
+    """Processes that are started in the ``with`` block compute with one thread."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)
     try:
@@ -113,15 +113,15 @@ def one_thread_each() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """Have this process end at once when its parent ends, and not minutes later, with its next row.
+    """End this process at once when its parent ends, not minutes later with its next row.
 
-    On Linux the kernel does it, also while a library holds the interpreter's lock; elsewhere a thread does.
+    On Linux the kernel does it, also while a library holds the interpreter's lock; on other systems a thread does.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent.pid:  # it ended before the request
+        if os.getppid() != parent.pid:  # it ended before prctl was called
             os._exit(1)
         return
 
@@ -133,8 +133,8 @@ def end_with_parent() -> None:
 
 
 def _serve(pipe: Connection, setup: Setup) -> None:
-    """Do the scenes that come through ``pipe`` and send their outcomes one by one, until it is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent, which keeps the rows, handles Ctrl-C
+    """Receive scenes from ``pipe`` and send their outcomes one by one, until it is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent, which stores the rows, handles Ctrl-C
     end_with_parent()
     bench = Workbench(setup)
     try:

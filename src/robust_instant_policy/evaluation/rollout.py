@@ -23,7 +23,7 @@ from robust_instant_policy.trajectory import Trajectory
 
 
 class ScenePolicy(Protocol):
-    """A fitted policy, to which also other keypoints can be given than perception finds."""
+    """A fitted policy that plans from an image, or from given keypoints."""
 
     def plan(self, observation: Observation) -> Plan: ...
 
@@ -40,10 +40,10 @@ def roll_out(
     variant: Variant,
     done: Collection[int] = (),
 ) -> Iterator[Episode]:
-    """Plan from ``observation``, of the task's last reset, and execute what the policy wants executed.
+    """Plan from ``observation``, the image of the task's last reset, and execute the trajectories of the policy.
 
-    Every execution starts from a fresh build of the scene; those numbered in ``done`` are left out. A plan that cannot
-    be made, or that the arm refuses, is a failed episode, not an error.
+    Every execution starts from a new build of the scene; the candidates in ``done`` are skipped. A plan that cannot be
+    made, or that the motion checks refuse, is a failed episode, not an error.
     """
     row = partial(Episode, scene=scene, variant=variant, candidate=0, candidates=1, tokens=0, confidence=None)
     if isinstance(policy, ClosedLoopPolicy):
@@ -81,7 +81,7 @@ def roll_out(
 
 
 def execute(task: Task, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
-    """Execute ``trajectory`` in the task's scene; one that the arm refuses is an execution that failed."""
+    """Execute ``trajectory`` in the task's scene; a trajectory that the motion checks refuse is a failed execution."""
     try:
         return task.execute(trajectory, on_frame)
     except UnreachableError as error:

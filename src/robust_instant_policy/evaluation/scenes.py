@@ -1,4 +1,4 @@
-"""Which scenes are drawn, for showing and for testing, and which demonstrations are shown."""
+"""Seeds of test scenes, and the demonstrations of an evaluation."""
 
 from __future__ import annotations
 
@@ -14,24 +14,31 @@ from robust_instant_policy.errors import NoDemonstrationsError
 from robust_instant_policy.tasks.record import record
 from robust_instant_policy.tasks.task import Task, bounded_seed
 
-FIRST_TEST_SEED = 100_000  # demonstrations draw scenes from 0 on, tests from here on
-SEED_BITS = 62  # of a scene's seed, which stands in tables of 64-bit integers
+# The scenes of demonstrations, of tuning and of tests never meet. Whatever is chosen, a network, a threshold, a prompt,
+# is chosen on demonstrations and tuning scenes; what is reported is measured on test scenes.
+SPLITS = {"tune": 100_000, "test": 1_000_000}  # seed of the first scene; demonstrations draw theirs from 0 on
+SEEDS_A_SET = 1_000  # of demonstrations, apart, so that sets of demonstrations share no scene
 SEEDS_A_RUN = 1_000  # apart, so that runs with different --seed share no scene
 IMAGES_HZ = 11.0  # about the rate at which demonstrations with images are recorded; rendering them takes long
 
 
-def scene_seed(seed: int, index: int) -> int:
-    """Seed of the ``index``-th test scene of a run with ``--seed seed``."""
-    return bounded_seed(FIRST_TEST_SEED + seed * SEEDS_A_RUN + index, SEED_BITS)
+def scene_seed(seed: int, index: int, split: str = "tune") -> int:
+    """Seed of the ``index``-th scene of a run with ``--seed seed`` in one of `SPLITS`."""
+    return bounded_seed(SPLITS[split] + seed * SEEDS_A_RUN + index)
+
+
+def first_demonstration_seed(demo_set: int) -> int:
+    """Seed of the first scene that is tried for a set of demonstrations."""
+    return demo_set * SEEDS_A_SET
 
 
 def demonstrations_folder(data: Path, task: str, with_images: bool) -> Path:
-    """Where in ``data`` the demonstrations of ``task`` are kept; with images, the same at a lower rate."""
+    """Folder in ``data`` of the demonstrations of ``task``; those with images have a lower rate."""
     return data / (f"{task}-images" if with_images else task)
 
 
 def stored_demonstrations(folder: Path, task: str, count: int) -> list[Demonstration]:
-    """The first ``count`` demonstrations of ``task`` in ``folder``, or as many as there are."""
+    """The first ``count`` demonstrations of ``task`` in ``folder``, or all if there are fewer."""
     try:
         return load_demonstrations(folder, task=task, limit=count)
     except NoDemonstrationsError:
@@ -44,11 +51,12 @@ def obtain_demonstrations(
     count: int,
     on_progress: Callable[[int, int, int], None] | None = None,
     with_images: bool = False,
+    demo_set: int = 0,
 ) -> list[Demonstration]:
-    """The first ``count`` demonstrations of ``task`` in ``folder``, recorded now where they are not there yet.
+    """The first ``count`` demonstrations of ``task`` in ``folder``; missing ones are recorded.
 
-    Those ``with_images`` along the way are recorded at about `IMAGES_HZ`. ``on_progress`` receives (episodes there,
-    episodes wanted, attempts thrown away).
+    ``demo_set`` decides in which scenes. ``with_images`` records the images of all steps, at about `IMAGES_HZ`.
+    ``on_progress`` receives (episodes stored, episodes wanted, attempts discarded).
     """
     shown = stored_demonstrations(folder, task.name, count)
     if len(shown) == count:
@@ -56,12 +64,13 @@ def obtain_demonstrations(
     every = max(1, round(task.record_hz / IMAGES_HZ)) if with_images else 1
     rate_hz = task.record_hz / every
     with DatasetWriter(folder, task=task.name, description=task.description, rate_hz=rate_hz) as writer:
-        record(task, writer, count, with_images=with_images, every=every, on_progress=on_progress)
+        seed = first_demonstration_seed(demo_set)
+        record(task, writer, count, seed, with_images=with_images, every=every, on_progress=on_progress)
     return load_demonstrations(folder, task=task.name, limit=count)
 
 
 def demonstration_digests(demonstrations: Iterable[Demonstration]) -> list[str]:
-    """Short digests of the first 0, 1, 2, … demonstrations: of every number that a method may read from them."""
+    """Short digests of the first 0, 1, 2, … demonstrations, over all numbers that methods read."""
     digest = hashlib.sha256()
     digests = [""]
     for demonstration in demonstrations:

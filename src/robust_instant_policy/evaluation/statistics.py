@@ -1,4 +1,8 @@
-"""Statistics of success rates: how often variants succeed, with intervals, and whether two of them differ."""
+"""Statistics of success rates: how often variants succeed, with intervals, and whether two of them differ.
+
+The unit is the scene. Executions in one scene, of several candidates or with several sets of demonstrations, are no
+independent trials: they meet the same objects in the same places.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +21,8 @@ from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.policies import METHOD_NAMES
 
 MARKS = ((5e-3, "**"), (5e-2, "*"))  # the paper's, below these p-values
+CONFIDENCE = 0.95
+RESAMPLES = 10_000  # of the bootstrap
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
@@ -27,6 +33,20 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
         return 0.0, 1.0
     interval = stats.binomtest(successes, trials).proportion_ci(method="wilson")
     return float(interval.low), float(interval.high)
+
+
+def scene_interval(mean: float, scenes: int) -> tuple[float, float]:
+    """95% confidence interval of the ``mean`` of the success rates in so many ``scenes``; (0, 1) without scenes.
+
+    Wilson's interval (Wilson 1927) with one trial a scene. A scene's rate, of whatever number of executions, varies at
+    most as much as a single execution with that probability, so the interval is not too narrow.
+    """
+    if scenes == 0:
+        return 0.0, 1.0
+    z = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
+    middle = (mean + z**2 / (2 * scenes)) / (1 + z**2 / scenes)
+    half = z / (1 + z**2 / scenes) * math.sqrt(mean * (1 - mean) / scenes + z**2 / (4 * scenes**2))
+    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 def mean_and_deviation(rates: Sequence[float]) -> tuple[float, float]:
@@ -70,7 +90,8 @@ def paired_test(ours: Mapping[Scene, Fraction], theirs: Mapping[Scene, Fraction]
     """Exact sign-flip test of the success rates in the scenes that two methods share.
 
     Were the methods alike, every scene's difference might as well have the other sign: p is the share of all choices of
-    signs with a total at least as far from 0. With one execution a scene this is McNemar's exact test.
+    signs with a total at least as far from 0. With one execution a scene this is McNemar's exact test. The scene is the
+    unit, however many executions its rate is of.
     """
     shared = [scene for scene in ours if scene in theirs]
     differences = [ours[scene] - theirs[scene] for scene in shared]
@@ -91,41 +112,100 @@ def paired_test(ours: Mapping[Scene, Fraction], theirs: Mapping[Scene, Fraction]
     )
 
 
+def difference_interval(ours: Mapping[Scene, Fraction], theirs: Mapping[Scene, Fraction]) -> tuple[float, float]:
+    """95% interval of the difference of two methods' success rates, averaged over tasks, by the cluster bootstrap:
+    scenes that both methods share are drawn with replacement, task by task (Davison and Hinkley 1997, Sec. 3.8).
+
+    NaN without shared scenes.
+    """
+    of_tasks: dict[str, list[float]] = {}
+    for scene in ours:
+        if scene in theirs:
+            of_tasks.setdefault(scene.task, []).append(float(ours[scene] - theirs[scene]))
+    if not of_tasks:
+        return math.nan, math.nan
+    rng = np.random.default_rng(0)
+    means = [rng.choice(one, (RESAMPLES, len(one))).mean(axis=1) for one in of_tasks.values()]
+    low, high = np.quantile(np.mean(means, axis=0), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Corrected for the number of comparisons (Holm 1979), in the same order; NaN stays, and counts as none."""
+    corrected = [math.nan] * len(p_values)
+    known = sorted((p, index) for index, p in enumerate(p_values) if not math.isnan(p))
+    largest = 0.0
+    for rank, (p, index) in enumerate(known):
+        largest = max(largest, min(1.0, p * (len(known) - rank)))
+        corrected[index] = largest
+    return corrected
+
+
 @dataclass(frozen=True)
 class Rate:
-    """``successes`` of ``trials`` executions."""
+    """Success of ``trials`` executions in some scenes: ``of_scenes`` are the shares that succeeded, scene by scene."""
 
-    successes: int
+    of_scenes: tuple[Fraction, ...]
     trials: int
 
     @property
     def value(self) -> float:
-        return self.successes / self.trials
+        return float(sum(self.of_scenes) / len(self.of_scenes))
+
+    @property
+    def scenes(self) -> int:
+        return len(self.of_scenes)
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95%, Wilson's."""
-        return wilson_interval(self.successes, self.trials)
+        """95%, see `scene_interval`."""
+        return scene_interval(self.value, self.scenes)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The reference against ``variant``: ``difference`` of the success rates averaged over the tasks that both were
+    tried in, with its ``interval``, the paper's t-test over these tasks, the test over scenes, and ``corrected``, its
+    p-value by Holm's method. NaN where there is nothing to compare.
+    """
+
+    variant: Variant
+    difference: float
+    interval: tuple[float, float]
+    t_test: float
+    paired: Paired
+    corrected: float
+
+    @property
+    def mark(self) -> str:
+        """The paper's stars where the reference is better."""
+        return mark(self.corrected) if self.difference > 0 else ""
 
 
 class Summary:
     """The success of the variants of ``suite``, counted from those of ``episodes`` that belong to it.
 
-    Where a variant was shown different demonstrations of one task, those shown last count.
+    Variants that differ in nothing but the set of demonstrations are one, whose rates are averages over the sets. Where
+    a variant was shown different demonstrations of one task and set, those shown last count.
     """
 
     def __init__(self, suite: Suite, episodes: Iterable[Episode]):
         self.suite = suite
         scenes = set(suite.scenes)
-        self._rows: dict[Variant, list[Episode]] = {variant: [] for variant in suite.variants}
+        wanted = set(suite.variants)
+        self._rows: dict[Variant, list[Episode]] = {of_any_set(variant): [] for variant in suite.variants}
         shown: dict[tuple[Variant, str], str] = {}
         for row in episodes:
             variant = replace(row.variant, demonstrations="")
-            if variant in self._rows and row.scene in scenes:
-                self._rows[variant].append(row)
+            if variant in wanted and row.scene in scenes:
+                self._rows[of_any_set(variant)].append(row)
                 shown[variant, row.scene.task] = row.variant.demonstrations
-        for variant, rows in self._rows.items():
-            rows[:] = [row for row in rows if row.variant.demonstrations == shown[variant, row.scene.task]]
+        for rows in self._rows.values():
+            rows[:] = [
+                row
+                for row in rows
+                if row.variant.demonstrations == shown[replace(row.variant, demonstrations=""), row.scene.task]
+            ]
         self.rows: list[Episode] = [row for rows in self._rows.values() for row in rows]
         known = [variant for variant, rows in self._rows.items() if rows]
         # whatever the order in which they were asked for, run by run
@@ -135,7 +215,7 @@ class Summary:
     def rate(self, variant: Variant, task: str | None = None) -> Rate | None:
         """In ``task``, or all executions together; None where there were none."""
         rows = [row for row in self._rows.get(variant, ()) if task in (None, row.scene.task)]
-        return Rate(sum(row.success for row in rows), len(rows)) if rows else None
+        return Rate(tuple(_means_of_scenes(rows).values()), len(rows)) if rows else None
 
     def of_tasks(self, variant: Variant, beside: Variant | None = None) -> list[float]:
         """The success rate in each task that the variant was tried in, and ``beside``, if given, was tried in, too."""
@@ -148,17 +228,69 @@ class Summary:
         """Mean and standard deviation of the success rate over tasks."""
         return mean_and_deviation(self.of_tasks(variant))
 
-    def of_scenes(self, variant: Variant) -> dict[Scene, Fraction]:
-        """The share of executions that succeeded, scene by scene."""
-        counts: dict[Scene, tuple[int, int]] = {}
+    def of_sets(self, variant: Variant) -> dict[int, float]:
+        """For each set of demonstrations the success rate, averaged over tasks."""
+        of_set: dict[int, list[Episode]] = {}
         for row in self._rows[variant]:
-            successes, trials = counts.get(row.scene, (0, 0))
-            counts[row.scene] = successes + row.success, trials + 1
-        return {scene: Fraction(*count) for scene, count in counts.items()}
+            of_set.setdefault(row.variant.demo_set, []).append(row)
+        return {number: _over_tasks(_means_of_scenes(of_set[number])) for number in sorted(of_set)}
+
+    def compare(self, ours: Variant) -> list[Comparison]:
+        """``ours`` against every other variant, each over the scenes and sets of demonstrations that both have."""
+        found = []
+        for variant in self.variants:
+            if variant == ours:
+                continue
+            known = [{(row.scene, row.variant.demo_set) for row in self._rows[one]} for one in (ours, variant)]
+            both = known[0] & known[1]
+            own, theirs = (
+                _means_of_scenes(row for row in self._rows[one] if (row.scene, row.variant.demo_set) in both)
+                for one in (ours, variant)
+            )
+            found.append(
+                Comparison(
+                    variant,
+                    _over_tasks(own) - _over_tasks(theirs),
+                    difference_interval(own, theirs),
+                    t_test(self.of_tasks(ours, variant), self.of_tasks(variant, ours)),
+                    paired_test(own, theirs),
+                    math.nan,
+                )
+            )
+        corrected = holm([one.paired.p if one.paired.scenes else math.nan for one in found])
+        return [replace(one, corrected=p) for one, p in zip(found, corrected, strict=True)]
 
     def best(self, task: str) -> float:
         """The highest success rate in ``task``."""
         return max(rate.value for variant in self.variants if (rate := self.rate(variant, task)) is not None)
+
+
+def of_any_set(variant: Variant) -> Variant:
+    """What variants have in common that differ in the set of demonstrations only."""
+    return replace(variant, demo_set=0)
+
+
+def _means_of_scenes(rows: Iterable[Episode]) -> dict[Scene, Fraction]:
+    """The share of executions that succeeded, scene by scene; sets of demonstrations count alike."""
+    counts: dict[Scene, dict[int, tuple[int, int]]] = {}
+    for row in rows:
+        of_sets = counts.setdefault(row.scene, {})
+        successes, trials = of_sets.get(row.variant.demo_set, (0, 0))
+        of_sets[row.variant.demo_set] = successes + row.success, trials + 1
+    return {
+        scene: sum((Fraction(*count) for count in of_sets.values()), Fraction(0)) / len(of_sets)
+        for scene, of_sets in counts.items()
+    }
+
+
+def _over_tasks(rates: Mapping[Scene, Fraction]) -> float:
+    """The average over tasks of the ``rates`` of scenes; NaN without scenes."""
+    of_tasks: dict[str, list[Fraction]] = {}
+    for scene, rate in rates.items():
+        of_tasks.setdefault(scene.task, []).append(rate)
+    if not of_tasks:
+        return math.nan
+    return float(np.mean([float(sum(own) / len(own)) for own in of_tasks.values()]))
 
 
 def reference(variants: Sequence[Variant]) -> Variant | None:

@@ -1,7 +1,7 @@
-"""``results.sqlite``: executions, failure analyses, suites and commands of a run's folder, keyed by all that decides.
+"""``results.sqlite``: executions, failure analyses, suites and commands of a run's folder.
 
-``episodes.parquet``, ``failures.parquet`` and ``run.json`` are exports of it. A folder that has only these, from an
-older version or from a repository, is read all the same.
+The key of a row holds everything that decides it. ``episodes.parquet``, ``failures.parquet`` and ``run.json`` are
+exports; a folder that holds only exports can be read, too.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _ARROW_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa
 
 @dataclass(frozen=True)
 class Results:
-    """What a run's folder holds: ``episodes`` and ``failures`` in the order in which they came, and the manifest."""
+    """Content of a run's folder: ``episodes`` and ``failures``, oldest first, and the manifest."""
 
     episodes: tuple[Episode, ...] = ()
     failures: tuple[Failure, ...] = ()
@@ -49,35 +49,35 @@ class Results:
 
 
 def holds_results(folder: Path) -> bool:
-    """Whether ``folder`` is that of an evaluation."""
+    """Whether ``folder`` is a run's folder."""
     return any((folder / name).exists() for name in (RESULTS_FILE, EPISODES_FILE))
 
 
 def read_results(folder: Path) -> Results:
-    """The results in ``folder``, none where there is nothing; changes nothing on disk, also while a run is under way.
+    """The results in ``folder``, empty if there are none. Reads only; a run may be in progress.
 
     Raises `DatasetError` for damaged files.
     """
     path = folder / RESULTS_FILE
     if path.exists():
         with _explained(path), closing(_connect(path, "rw")) as database:
-            if _EPISODES.columns(database):  # else it was killed before it took the exports
+            if _EPISODES.columns(database):  # else its writer was killed before it had read the exports
                 return _read(database)
     return _read_exports(folder)
 
 
 def export_results(folder: Path) -> None:
-    """Write the exports of ``folder`` again; where it has nothing else, they stay as they are."""
+    """Write the exports of ``folder`` again, if it holds ``results.sqlite``."""
     if (folder / RESULTS_FILE).exists():
         _write_exports(folder, read_results(folder))
 
 
 class ResultsStore:
-    """The results of ``folder`` for one writer; readers may look at any time.
+    """The results of ``folder``, for one writer; reading is possible at any time.
 
-    A row is on disk when `add` returns, or not at all: a kill, a power cut or a full disk leaves whole rows only.
-    SQLite's rollback journal is kept, not its write-ahead log: rows are few, and folders are copied and mounted.
-    Raises `DatasetError` where the file is damaged or cannot be written.
+    A row is on disk when `add` returns; a kill, a power cut or a full disk never leaves a part of a row. The journal is
+    SQLite's rollback journal, because a write-ahead log does not work on network file systems.
+    Raises `DatasetError` if the file is damaged or cannot be written.
     """
 
     def __init__(self, folder: Path):
@@ -90,10 +90,7 @@ class ResultsStore:
             is_new = not _EPISODES.columns(self._database)
             for table in (_EPISODES, _FAILURES, _INVOCATIONS):
                 table.create(self._database)
-            self._database.execute(
-                "CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, content TEXT NOT NULL, "
-                "PRIMARY KEY (name, objects, assets))"
-            )
+            _create_suites(self._database)
             if is_new:
                 self._take(_read_exports(folder))
 
@@ -105,19 +102,19 @@ class ResultsStore:
             return _read(self._database)
 
     def add(self, *rows: Episode | Failure) -> None:
-        """Keep ``rows``, all or none of them; one whose key is known already is not kept twice."""
+        """Store ``rows``, all or none; a row whose key exists is ignored."""
         with self._transaction():
             for row in rows:
                 (_EPISODES if isinstance(row, Episode) else _FAILURES).insert(self._database, row)
 
     def note(self, manifest: Manifest) -> None:
-        """Add the suites and commands of ``manifest``; suites of one name and the same objects become one."""
+        """Add the suites and commands of ``manifest``; suites of the same name and objects are merged."""
         with self._transaction():
             self._take(Results(manifest=manifest))
 
     @contextmanager
     def invocation(self, suites: Iterable[Suite], arguments: Iterable[str], model: str) -> Iterator[None]:
-        """Note ``suites`` and the command that works on them meanwhile, whether it ends well or is stopped; export."""
+        """Store ``suites`` and, at the end of the ``with`` block (also after an error), the command; then export."""
         self.note(Manifest(tuple(suites)))
         began, start = datetime.now(UTC), time.monotonic()
         try:
@@ -143,12 +140,12 @@ class ResultsStore:
             _EPISODES.insert(self._database, episode)
         for failure in results.failures:
             _FAILURES.insert(self._database, failure)
-        known = {(suite.name, suite.objects, suite.assets): suite for suite in _read_suites(self._database)}
+        known = {suite.identity: suite for suite in _read_suites(self._database)}
         for suite in results.manifest.suites:
-            identity = suite.name, suite.objects, suite.assets
+            identity = suite.identity
             known[identity] = known[identity].merged(suite) if identity in known else suite
             self._database.execute(
-                "INSERT INTO suites VALUES (?, ?, ?, ?) ON CONFLICT DO UPDATE SET content = excluded.content",
+                "INSERT INTO suites VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET content = excluded.content",
                 (*identity, json.dumps(asdict(known[identity]))),
             )
         for command in results.manifest.invocations:
@@ -156,13 +153,13 @@ class ResultsStore:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        with _explained(self.path), self._database:  # commits, or takes back
+        with _explained(self.path), self._database:  # commits or rolls back
             self._database.execute("BEGIN IMMEDIATE")
             yield
 
 
 class _Column(NamedTuple):
-    """``default`` is MISSING where the column must be there."""
+    """``default`` is MISSING for a required column."""
 
     kind: type
     may_be_empty: bool
@@ -170,7 +167,7 @@ class _Column(NamedTuple):
 
 
 class _Table:
-    """A table with a column for each field of ``kind`` and of the dataclasses in it; ``key`` tells its rows apart."""
+    """A table with a column for each field of ``kind`` and of the dataclasses in it, and the unique ``key``."""
 
     def __init__(self, name: str, kind: type, key: Iterable[str]):
         self._name, self._kind = name, kind
@@ -181,7 +178,7 @@ class _Table:
         self._insert = f"INSERT OR IGNORE INTO {name} ({', '.join(self._columns)}) VALUES ({marks})"
 
     def create(self, database: sqlite3.Connection) -> None:
-        """Make the table, or add the columns that came after an older version made it."""
+        """Create the table, or add the columns that an older version did not have."""
         columns = {column: _SQL_TYPES[one.kind] for column, one in self._columns.items()}
         known = self.columns(database)
         if not known:
@@ -192,14 +189,14 @@ class _Table:
                 database.execute(f"ALTER TABLE {self._name} ADD COLUMN {column} {columns[column]}")
                 database.execute(f"UPDATE {self._name} SET {column} = ?", (self._defaults[column],))
             database.execute(f"DROP INDEX IF EXISTS {self._name}_key")
-        # SQLite takes no two NULL for the same
+        # NULL differs from NULL in a unique index
         key = ", ".join(
             f"IFNULL({column}, '')" if self._columns[column].may_be_empty else column for column in self._key
         )
         database.execute(f"CREATE UNIQUE INDEX IF NOT EXISTS {self._name}_key ON {self._name} ({key})")
 
     def columns(self, database: sqlite3.Connection) -> set[str]:
-        """Those in the file; none where the table is not there."""
+        """The columns in the file; empty if the table does not exist."""
         return {row[1] for row in database.execute(f"PRAGMA table_info({self._name})")}
 
     def insert(self, database: sqlite3.Connection, row: Any) -> None:
@@ -216,7 +213,7 @@ class _Table:
         return pa.Table.from_pylist([_flat(row) for row in rows], schema=schema)
 
     def read_parquet(self, path: Path) -> Iterator[Any]:
-        """The rows of an export; columns that came after it was written have the default of their field."""
+        """The rows of an export; columns that it does not have get the default of their field."""
         if not path.exists():
             return
         try:
@@ -277,6 +274,20 @@ _FAILURES = _Table("failures", Failure, _KEY)
 _INVOCATIONS = _Table("invocations", Invocation, _columns_of(Invocation))
 
 
+def _create_suites(database: sqlite3.Connection) -> None:
+    """Make the table of suites, or make it anew from that of a version that knew no levels."""
+    columns = {row[1] for row in database.execute("PRAGMA table_info(suites)")}
+    if columns and "level" not in columns:
+        database.execute("ALTER TABLE suites RENAME TO older_suites")
+    database.execute(
+        "CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, level TEXT, content TEXT NOT NULL, "
+        "PRIMARY KEY (name, objects, assets, level))"
+    )
+    if columns and "level" not in columns:
+        database.execute("INSERT INTO suites SELECT name, objects, assets, 'paper', content FROM older_suites")
+        database.execute("DROP TABLE older_suites")
+
+
 def _read(database: sqlite3.Connection) -> Results:
     invocations = sorted(_INVOCATIONS.read(database), key=lambda command: command.began)
     manifest = Manifest(_read_suites(database), tuple(invocations))
@@ -323,7 +334,7 @@ def _explained(path: Path) -> Iterator[None]:
         yield
     except sqlite3.OperationalError as error:
         raise DatasetError(
-            f"cannot use {path}: {error}; what was finished is kept: free space on the disk, or wait for the process "
+            f"cannot use {path}: {error}; finished work is kept: free space on the disk, or wait for the process "
             "that uses it, and run the same command again"
         ) from None
     except (sqlite3.DatabaseError, ValueError, KeyError, TypeError) as error:

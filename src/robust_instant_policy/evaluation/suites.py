@@ -10,10 +10,11 @@ from typing import Any
 from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.evaluation.paper import TABLE1_TASKS
 from robust_instant_policy.evaluation.scenes import scene_seed
-from robust_instant_policy.evaluation.variant import Scene, Variant, require_no_path
+from robust_instant_policy.evaluation.variant import Scene, Variant, configs, require_no_path
 from robust_instant_policy.policies import METHOD_NAMES
 from robust_instant_policy.policies.training import DEFAULT_STEPS
-from robust_instant_policy.tasks import TASK_NAMES
+from robust_instant_policy.tasks import TASK_NAMES, UNSEEN_TASKS
+from robust_instant_policy.tasks.level import make_level
 
 SIMULATION_TASKS = TABLE1_TASKS[:5]
 # "tasks in which gripper actions were essential"
@@ -23,13 +24,16 @@ QUERIES = (2, 3, 5, 10)
 DOFS = (1.25, 1.5, 3.0, math.inf)
 HYPERPARAMETER_DEMOS = 20  # shown where Q and ν are varied
 CHOSEN = "chosen"  # not an analysis of the paper: what the user's tasks and methods say
-SAMPLING_METHODS = ("rip", "rip-gauss", "kat")  # those of the paper that share their samples
+SAMPLING_METHODS = ("rip", "rip-gauss", "mean", "kat")  # those that share their samples
+PAPER_METHODS = (*SAMPLING_METHODS, "dp", "kat-dp")  # those that there are in the paper's configuration, by default
 
 
 @dataclass(frozen=True)
 class Suite:
     """Every one of ``variants`` in the new scenes ``seeds`` of every task, with "seen" or "unseen" ``objects``, whose
-    shapes come from ``assets``, as in `Scene`.
+    shapes come from ``assets``, at a ``level``, as in `Scene`.
+
+    At another level than the paper's, "unseen" means the objects of the only set for tasks that have one.
     """
 
     name: str
@@ -38,9 +42,10 @@ class Suite:
     seeds: tuple[int, ...]
     objects: str = "seen"
     assets: str = "code"
+    level: str = "paper"
 
     def __post_init__(self) -> None:
-        require_no_path(self.name, self.objects, self.assets)
+        require_no_path(self.name, self.objects, self.assets, self.level)
         for kind, names, known in (
             ("task", self.tasks, TASK_NAMES),
             ("method", [variant.method for variant in self.variants], METHOD_NAMES),
@@ -58,15 +63,38 @@ class Suite:
 
     @property
     def scenes(self) -> list[Scene]:
-        return [Scene(task, self.objects, seed, self.assets) for task in self.tasks for seed in self.seeds]
+        return [
+            Scene(task, self._objects(task), seed, self.assets, self.level)
+            for task in self.tasks
+            for seed in self.seeds
+        ]
+
+    def _objects(self, task: str) -> str:
+        return self.objects if self.level == "paper" or task in UNSEEN_TASKS else "seen"
+
+    @property
+    def identity(self) -> tuple[str, str, str, str]:
+        """What suites have in common that become one."""
+        return self.name, self.objects, self.assets, self.level
+
+    def with_demonstrations(self, demo_set: int) -> Suite:
+        """The same with another set of demonstrations."""
+        return replace(self, variants=tuple(replace(variant, demo_set=demo_set) for variant in self.variants))
 
     @property
     def keeps_plans(self) -> bool:
         """Whether plans are kept, to be drawn."""
         return self.name == "trajectories"
 
+    def by_config(self) -> dict[str, Suite]:
+        """The suite of each configuration by itself; methods for which all configurations are one stand in each."""
+        return {
+            config: replace(self, variants=tuple(one for one in self.variants if one.config in (config, "")))
+            for config in configs(self.variants)
+        }
+
     def merged(self, other: Suite) -> Suite:
-        """This and another suite of the same name, objects and assets as one."""
+        """This and another suite of the same name, objects, assets and level as one."""
         return replace(
             self,
             tasks=tuple(dict.fromkeys((*self.tasks, *other.tasks))),
@@ -77,8 +105,9 @@ class Suite:
 
 @dataclass(frozen=True)
 class Choice:
-    """What the user asked for; None where the suite decides as the paper does.
+    """What the user asked for; None where the suite decides as the paper does, and for the objects of the ``level``.
 
+    ``seed`` is that of the run in ``split``, see `scene_seed`.
     ``steps`` is how long methods are trained that must be: the ``base`` may be one that need not.
     """
 
@@ -87,15 +116,18 @@ class Choice:
     methods: Sequence[str] | None = None
     num_scenes: int = 10
     seed: int = 0
-    objects: str = "seen"
+    objects: str | None = None
     assets: str = "code"
+    level: str = "paper"
+    split: str = "test"
     steps: int = DEFAULT_STEPS
 
 
 def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:
     """The analyses called ``names``, of which "all" stands for every one; raises `UnknownNameError` for others."""
     wanted = [one for name in names for one in (SUITE_NAMES if name == "all" else (name,))]
-    seeds = tuple(scene_seed(choice.seed, index) for index in range(choice.num_scenes))
+    seeds = tuple(scene_seed(choice.seed, index, choice.split) for index in range(choice.num_scenes))
+    objects = choice.objects or make_level(choice.level).objects
     suites = []
     for name in dict.fromkeys(wanted):
         if name not in _SUITES:
@@ -103,11 +135,14 @@ def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:
         tasks, variants = _SUITES[name](choice)
         if not tasks:
             raise UsageError(f"none of the chosen tasks is one that suite {name} is about")
-        suites.append(Suite(name, tuple(tasks), tuple(dict.fromkeys(variants)), seeds, choice.objects, choice.assets))
+        unique = tuple(dict.fromkeys(variants))
+        suites.append(Suite(name, tuple(tasks), unique, seeds, objects, choice.assets, choice.level))
     return suites
 
 
 def _methods(choice: Choice, default: Sequence[str] = METHOD_NAMES) -> list[Variant]:
+    if choice.base.config != "adaptive":
+        default = [method for method in default if method in PAPER_METHODS]
     return [replace(choice.base, method=method, steps=choice.steps) for method in choice.methods or default]
 
 

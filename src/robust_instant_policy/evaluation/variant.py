@@ -8,9 +8,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 from robust_instant_policy.errors import InvalidValueError
-from robust_instant_policy.policies import ASKING_METHODS, REGRESSING_METHODS, TRAINED_METHODS
+from robust_instant_policy.policies import (
+    ASKING_METHODS,
+    CONFIGS,
+    IMAGE_METHODS,
+    REGRESSING_METHODS,
+    TRAINED_METHODS,
+)
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.regression import DEFAULT_DOF
+
+PAPER_CONFIGS = ("paper", "paper-real")  # whose rows may stand beside the paper's numbers
+EXACT = "em-number"  # the model of the paper's networks, fitted exactly: an estimator of the paper's configuration, too
 
 
 @dataclass(frozen=True)
@@ -18,11 +27,14 @@ class Variant:
     """A method with every setting that its plans depend on, beside demonstrations and scene.
 
     ``demos`` demonstrations are shown; ``queries`` is the paper's Q, ``dof`` its ν; ``downsampling``, ``frames``,
-    ``layout`` and ``features`` are those of `Settings`; ``model`` names the language model; ``steps`` is how long
-    a method is trained; ``deadline_s`` bounds the sampling for one plan; ``code`` is the `code_digest` of the package,
-    which stands for every setting that has no name here; ``demonstrations`` the digest of those that were shown. What
-    a method does not use is always empty (a number None), so that the same work is never done, nor counted, under two
-    names; RIP with ν = ∞ is "rip-gauss". Rows of versions that did not note a setting have it empty, too: unknown.
+    ``layout``, ``features``, ``keypoints``, ``column`` and ``estimator`` are those of `Settings`; ``config`` names
+    the configuration that these make: the one of `CONFIGS` that is nearest, with what differs; it is never given;
+    ``model`` names the language model; ``steps`` is how long a method is trained; ``deadline_s`` bounds the
+    sampling for one plan; ``code`` is the `code_digest` of the package, which stands for every setting that has no
+    name here; ``demonstrations`` the digest of those that were shown, which are of the set ``demo_set`` (see
+    `scenes.first_demonstration_seed`). What a method does not use is always empty (a number None), so that the same
+    work is never done, nor counted, under two names; RIP with ν = ∞ is "rip-gauss". Rows of versions that did not note
+    a setting have it empty, too: unknown.
     """
 
     method: str
@@ -38,6 +50,11 @@ class Variant:
     deadline_s: float | None = None
     code: str = ""
     demonstrations: str = ""
+    demo_set: int = 0
+    keypoints: str = "registration"
+    column: str = "auto"
+    estimator: str = "em"
+    config: str = ""
 
     def __post_init__(self) -> None:
         changed: dict[str, str | float | None] = {}
@@ -49,33 +66,50 @@ class Variant:
             changed["dof"] = math.inf
         elif self.method not in REGRESSING_METHODS:
             changed["dof"] = None
+        if self.method not in REGRESSING_METHODS:
+            changed["estimator"] = ""
         if self.method not in ASKING_METHODS:
             changed |= {"frames": "", "layout": "", "model": "", "deadline_s": None}
+        if self.method in IMAGE_METHODS:
+            changed |= {"keypoints": "", "column": ""}
         for name, value in changed.items():
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "config", _config(self))
 
     @property
     def file_name(self) -> str:
         """Everything, so that no two variants have the same."""
         features = "" if self.features == "auto" else self.features
         deadline = "" if self.deadline_s is None else f"{self.deadline_s:g}s"
-        words = (str(self), features, self.model, deadline, self.code, self.demonstrations)
+        column = "" if self.column == "auto" else self.column
+        words = (str(self), column, features, self.model, deadline, self.code, self.demonstrations)
         return re.sub(r"[^\w.-]+", "_", "-".join(word for word in words if word))
 
     def __str__(self) -> str:
-        """What a reader chose, without network, language model and versions, in a few words."""
+        """What a reader chose, without descriptors, language model and versions, in a few words."""
         dof = "" if self.dof is None else f"v{self.dof:g}"
         words = (
             self.method,
             f"{self.demos}demos",
             f"q{self.queries}",
             dof,
+            self.config,
             self.downsampling,
+            self.keypoints,
             self.frames,
             self.layout,
+            self.estimator,
             "" if self.steps is None else f"{self.steps}steps",
+            f"set{self.demo_set}" if self.demo_set else "",
         )
         return "-".join(word for word in words if word)
+
+
+_ADAPTIVE = {
+    "keypoints": "registration", "column": "auto", "frames": "adaptive", "layout": "factorised", "estimator": "em"
+}  # fmt: skip
+_CONFIGURED = tuple(_ADAPTIVE)
+_NAMES = ("config", *(field.name for field in fields(Variant) if field.name not in ("method", "config")))
 
 
 def labels(variants: Sequence[Variant]) -> list[str]:
@@ -87,10 +121,44 @@ def labels(variants: Sequence[Variant]) -> list[str]:
     told = []
     for variant in variants:
         same = [other for other in variants if other.method == variant.method]
-        names = [field.name for field in fields(Variant) if len({getattr(other, field.name) for other in same}) > 1]
+        names = [name for name in _NAMES if len({getattr(other, name) for other in same}) > 1]
+        if "config" in names:  # it says what follows from it
+            names = [name for name in names if name not in _CONFIGURED or _differ_within_a_config(same, name)]
         settings = ", ".join(f"{name} {getattr(variant, name) or 'unknown'}" for name in names)
         told.append(f"{variant.method} ({settings})" if settings else variant.method)
     return told
+
+
+def configs(variants: Sequence[Variant]) -> list[str]:
+    """The configurations of ``variants``, in a fixed order; ``[""]`` for methods for which all are one, such as dp."""
+    known = {variant.config for variant in variants} - {""}
+    return sorted(known, key=lambda config: (list(CONFIGS).index(config.split(",")[0]), config)) or [""]
+
+
+def _config(variant: Variant) -> str:
+    used = {name: value for name in _CONFIGURED if (value := getattr(variant, name))}
+    if not used:
+        return ""
+    if variant.method == "neighbours":  # they need the factorised layout
+        used |= {"frames": "adaptive", "layout": "factorised"}
+    differences = {
+        name: [
+            f"{key} {value}"
+            for key, value in used.items()
+            if value != {**_ADAPTIVE, **settings}[key] and not (name in PAPER_CONFIGS and value == EXACT)
+        ]
+        for name, settings in CONFIGS.items()
+    }
+    nearest = min(differences, key=lambda name: len(differences[name]))
+    return ", ".join((nearest, *differences[nearest]))
+
+
+def _differ_within_a_config(variants: Sequence[Variant], name: str) -> bool:
+    return any(
+        one.config == other.config and getattr(one, name) != getattr(other, name)
+        for one in variants
+        for other in variants
+    )
 
 
 def values(variants: Sequence[Variant], value: Callable[[Variant], str]) -> list[str]:
@@ -100,6 +168,8 @@ def values(variants: Sequence[Variant], value: Callable[[Variant], str]) -> list
 
 
 def dof_symbol(variant: Variant) -> str:
+    if variant.method == "mean":
+        return "mean"
     return "∞" if variant.dof is None or math.isinf(variant.dof) else f"{variant.dof:g}"
 
 
@@ -123,16 +193,19 @@ def require_no_path(*names: str) -> None:
 class Scene:
     """A drawn scene of ``task``, with ``objects`` that are "seen" in the demonstrations or "unseen".
 
-    ``assets`` is where their shapes come from: built in "code", or "maniskill"'s downloads.
+    ``assets`` is where their shapes come from: built in "code", or "maniskill"'s downloads; ``level`` is "paper" or
+    "hard", see `tasks.level.Level`.
     """
 
     task: str
     objects: str
     seed: int
     assets: str = "code"
+    level: str = "paper"
 
     def __post_init__(self) -> None:
-        require_no_path(self.task, self.objects, self.assets)
+        require_no_path(self.task, self.objects, self.assets, self.level)
 
     def __str__(self) -> str:
-        return f"{self.task}-{self.objects}-{self.seed}" + ("" if self.assets == "code" else f"-{self.assets}")
+        unusual = [value for value, usual in ((self.assets, "code"), (self.level, "paper")) if value != usual]
+        return "-".join((self.task, self.objects, str(self.seed), *unusual))

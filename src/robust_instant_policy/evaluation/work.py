@@ -1,4 +1,4 @@
-"""What a worker is given, and what it gives back."""
+"""The input of a worker (`Setup`, `SceneWork`) and its output (`Outcome`)."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ STORE_FILE = "samples.sqlite"  # in a run's folder: every answer of the language
 
 @dataclass(frozen=True)
 class Setup:
-    """What every worker needs to know: the language model, where samples and demonstrations are, and what to keep.
+    """Settings that all workers share.
 
-    ``llm`` is a line for `llm.connect`; with ``replay`` only stored answers are used. ``deadline_s`` bounds the
-    sampling for one plan. With ``films`` every failed episode is filmed. ``checkpoints`` is where methods that are
-    trained keep their weights.
+    ``llm`` is a spec for `llm.connect`; with ``replay`` only the answers in ``store`` are used. ``data`` is the folder
+    of demonstrations, ``deadline_s`` the time limit of the sampling for one plan. With ``analyses`` each failed
+    episode is analysed, and with ``films`` filmed. ``checkpoints`` is the folder for the weights of trained methods;
+    ``demo_set`` is the number of the set of demonstrations in ``data``.
     """
 
     llm: str
@@ -31,11 +32,13 @@ class Setup:
     deadline_s: float
     films: bool
     checkpoints: Path = DEFAULT_CHECKPOINTS
+    demo_set: int = 0
+    analyses: bool = True
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """The analysis of a failed episode; ``video`` is an MP4, empty where none was wanted or nothing moved."""
+    """The analysis of a failed episode; ``video`` is an MP4, empty if not requested or if nothing moved."""
 
     failure: Failure
     video: bytes = b""
@@ -43,7 +46,7 @@ class Analysis:
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """A plan that is kept, for a picture."""
+    """A plan that is stored for a figure."""
 
     scene: Scene
     variant: Variant
@@ -55,28 +58,28 @@ Outcome = Episode | Analysis | Planned
 
 @dataclass(frozen=True)
 class SceneWork:
-    """What is still to be done in one scene: the ``variants`` that lack executions, those ``done`` before, the
-    ``failed`` episodes that have not been analysed yet, and the variants whose ``plans`` are wanted.
+    """Missing work in one scene: ``variants`` that lack executions, executions that are ``done``, ``failed`` episodes
+    that are not analysed, and variants whose ``plans`` are to be stored.
     """
 
     scene: Scene
-    variants: tuple[Variant, ...]
+    variants: tuple[Variant, ...] = ()
     done: frozenset[EpisodeKey] = frozenset()
     failed: tuple[Episode, ...] = ()
     plans: tuple[Variant, ...] = ()
 
     @property
     def concerned(self) -> tuple[Variant, ...]:
-        """Every variant that any of it is about."""
+        """All variants in this work."""
         return (*self.variants, *(episode.variant for episode in self.failed), *self.plans)
 
     @property
     def demos(self) -> int:
-        """The most demonstrations that any of it needs."""
+        """The largest number of demonstrations that a variant needs."""
         return max(variant.demos for variant in self.concerned)
 
     def without(self, outcomes: Collection[Outcome]) -> SceneWork:
-        """What is left of the work once ``outcomes`` are there."""
+        """The work that is left after ``outcomes``."""
         done, failed = set(self.done), {episode.key: episode for episode in self.failed}
         planned = {outcome.variant for outcome in outcomes if isinstance(outcome, Planned)}
         for outcome in outcomes:
@@ -90,5 +93,5 @@ class SceneWork:
         return replace(self, done=frozenset(done), failed=tuple(failed.values()), plans=plans)
 
 
-# Workers, on this machine or many: they do scenes in any order, each as soon as one of them is free.
+# Does scenes in any order, in parallel, on one machine or many.
 Workers = Callable[[Setup, list[SceneWork]], Iterator[Outcome]]

@@ -1,7 +1,7 @@
-"""What a worker works with: one simulator at a time, fitted policies, the model, and what was computed before.
+"""The state of a worker: one simulator at a time, fitted policies, the language model, and cached results.
 
-This is the only memory of an evaluation, keyed by values: contexts by the number of demonstrations and the settings
-that decide them; keypoints and samples of the present scene by the same. Methods, and numbers of queries, share them.
+This is the only cache of an evaluation. Contexts, and the keypoints and samples of the current scene, are keyed by the
+number of demonstrations and the settings that decide them. Methods share them.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ DemonstrationSource = Callable[[str, int], list[Demonstration]]  # task, how man
 
 
 class Workbench:
-    """Runs scenes one after the other; whatever the next scene can use again stays.
+    """Runs scenes one after the other and reuses what they share.
 
-    ``store`` and ``demonstrations`` default to the files that ``setup`` names.
+    ``store`` and ``demonstrations`` default to the files in ``setup``.
     """
 
     def __init__(
@@ -67,11 +67,11 @@ class Workbench:
         self._report = report
         self._demonstrations = demonstrations or self._read_demonstrations
         self._task: Task | None = None
-        self._place = ("", "", "")  # the task, the set of objects and their source that the simulator holds
+        self._place = ("", "", "", "")  # task, set of objects, their source and level in the simulator
         self._forget()
 
     def run(self, work: SceneWork) -> Iterator[Outcome]:
-        """Everything that is to be done in one scene: first all executions, then the analysis of failed ones."""
+        """Do the work in one scene: first all executions, then the analysis of failed ones."""
         task = self._enter(work.scene)
         self._show(work)
         observation = task.reset(work.scene.seed)
@@ -90,10 +90,11 @@ class Workbench:
             if isinstance(policy, RememberingPolicy):
                 with suppress(KeypointError, PlanningError):
                     yield Planned(work.scene, variant, policy.plan(observation))
-        yield from self._analyse(task, work.scene, failed, observation)
+        if self._setup.analyses:
+            yield from self._analyse(task, work.scene, failed, observation)
 
     def train(self, work: SceneWork, variant: Variant) -> TrainedPolicy:
-        """Make and train the policy of ``variant`` for the scenes of ``work``, as `run` would."""
+        """Train the policy of ``variant`` for the scene of ``work``, as `run` would."""
         self._enter(work.scene)
         self._show(work)
         policy = self._policy(variant)
@@ -108,21 +109,21 @@ class Workbench:
 
     @cached_property
     def model(self) -> LanguageModel:
-        """Loaded when a method asks it first: not every method does."""
+        """Loaded at the first request, because not every method makes one."""
         store = self._given_store or SampleStore(self._setup.store)
         if self._setup.replay:
             return ReplayedModel(store, model_name(self._setup.llm))
         return RecordedModel(connect(self._setup.llm), store)
 
     def _enter(self, scene: Scene) -> Task:
-        place = (scene.task, scene.objects, scene.assets)
+        place = (scene.task, scene.objects, scene.assets, scene.level)
         if self._task is None or self._place != place:
             if self._task is not None:
                 self._task.close()
                 self._task = None
             if self._place[0] != scene.task:
                 self._forget()
-            self._task = make_task(scene.task, scene.objects, scene.assets)
+            self._task = make_task(scene.task, scene.objects, scene.assets, scene.level)
             self._place = place
         return self._task
 
@@ -144,14 +145,14 @@ class Workbench:
         return load_demonstrations(folder, task=task, limit=count)
 
     def context(self, demos: int, settings: Settings) -> Context:
-        """Of the first ``demos`` demonstrations."""
+        """The context of the first ``demos`` demonstrations."""
         key = demos, settings.of_context
         if key not in self._contexts:
             self._contexts[key] = build_context(self._shown[:demos], settings)
         return self._contexts[key]
 
     def plan(self, policy: KeypointPolicy, demos: int, observation: Observation) -> Plan:
-        """The plan for the present scene, of which ``observation`` is the image."""
+        """The plan for the current scene, whose image is ``observation``."""
         key = demos, policy.settings.of_context
         if key not in self._located:
             self._located[key] = locate(policy.context_, observation)
@@ -166,8 +167,9 @@ class Workbench:
         settings = Settings(
             features=variant.features, downsampling=variant.downsampling, num_queries=variant.queries
         ).changed(workspace=self._task.workspace)
-        if variant.frames:  # empty for methods that write no prompt
-            settings = settings.changed(frames=variant.frames, layout=variant.layout)
+        for name in ("keypoints", "column", "frames", "layout", "estimator"):  # empty where the method has none
+            if value := getattr(variant, name):
+                settings = settings.changed(**{name: value})
         return settings if variant.dof is None else settings.changed(dof=variant.dof)
 
     def _policy(self, variant: Variant) -> RememberingPolicy | ClosedLoopPolicy:
@@ -213,14 +215,14 @@ class Workbench:
             yield Analysis(failure, film(task, policy, observation, episode.candidate) if self._setup.films else b"")
 
     def _truth_of_demonstrations(self, demos: int) -> list[SceneTruth] | None:
-        """Of each demonstration that is shown; None where one was not recorded in a scene that can be drawn again."""
+        """The true scene of each demonstration; None if the seed of one of them is unknown."""
         shown = self._shown[:demos]
         seeds = [demonstration.seed for demonstration in shown if demonstration.seed is not None]
         if len(seeds) < len(shown):
             return None
         if len(self._shown_truth) < demos:
-            name, objects, assets = self._place
-            apart = None if objects == "seen" else make_task(name, assets=assets)
+            name, objects, assets, level = self._place
+            apart = None if objects == "seen" else make_task(name, assets=assets, level=level)
             task = apart or self._task
             assert task is not None
             try:
@@ -234,7 +236,7 @@ class Workbench:
 
 
 class RememberingPolicy:
-    """A fitted policy that shares what the workbench remembers of the present scene."""
+    """A fitted policy that uses the workbench's cache of the current scene."""
 
     def __init__(self, bench: Workbench, policy: KeypointPolicy, demos: int):
         self._bench, self.policy, self._demos = bench, policy, demos
@@ -243,7 +245,7 @@ class RememberingPolicy:
         return self._bench.plan(self.policy, self._demos, observation)
 
     def plan_scene(self, scene: LocatedScene) -> Plan:
-        """From other keypoints, of which nothing is remembered."""
+        """Plan from given keypoints, without the cache."""
         return self.policy.plan_scene(scene)
 
     def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
@@ -251,7 +253,7 @@ class RememberingPolicy:
 
 
 class _Later:
-    """The workbench's model, loaded when it is first used."""
+    """The workbench's model, loaded at the first use."""
 
     def __init__(self, bench: Workbench):
         self._bench = bench

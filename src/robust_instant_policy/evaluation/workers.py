@@ -1,4 +1,4 @@
-"""A pool of workers that do scenes: which scene goes to which worker, what an error and a death mean.
+"""Distribute scenes over a pool of workers, and handle errors and deaths of workers.
 
 `evaluation.processes` and `evaluation.cluster` are the two kinds of pools.
 """
@@ -14,43 +14,43 @@ from robust_instant_policy.errors import RipError
 from robust_instant_policy.evaluation.variant import Scene
 from robust_instant_policy.evaluation.work import Outcome, SceneWork
 
-MAX_DEATHS = 3  # workers that one scene may take with it before the run gives up
+MAX_DEATHS = 3  # workers that may die in one scene before the run stops
 
-# Sums depend in their last bits on the number of threads that share them, and prompts on every bit: one thread a
-# worker gives the same rows whatever the machine. It is faster, too; --workers is the way to use more cores.
+# The last bits of a sum depend on the number of threads, and prompts depend on these bits. With one thread per worker,
+# rows do not depend on the machine. Use --workers for more cores.
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A worker has done all of its scene."""
+    """A worker has finished its scene."""
 
 
 @dataclass(frozen=True)
 class Died:
-    """A worker has ended because of ``cause``."""
+    """A worker has died of ``cause``."""
 
     cause: str
 
 
 @dataclass(frozen=True)
 class WorkError:
-    """An error that ended a worker's work, in words that travel: errors themselves need not survive a pipe."""
+    """An error in a worker, as text, because not every exception can be pickled."""
 
-    words: str
+    message: str
     exit_code: int
     trace: str
 
     @classmethod
     def of(cls, error: Exception) -> WorkError:
-        """To be called where ``error`` was caught."""
+        """Call it in the ``except`` block: it stores the traceback."""
         if isinstance(error, RipError):
             return cls(str(error), error.exit_code, traceback.format_exc())
         return cls(f"unexpected {type(error).__name__}: {error}", RipError.exit_code, traceback.format_exc())
 
     def as_error(self) -> RipError:
-        """The error to raise where the rows are kept; ``--debug`` shows the worker's trace."""
-        error = RipError(self.words)
+        """The same error for the main process; ``--debug`` shows the worker's traceback."""
+        error = RipError(self.message)
         error.exit_code = self.exit_code
         error.add_note(self.trace)
         return error
@@ -61,7 +61,7 @@ Message = Outcome | Finished | WorkError | Died
 
 @dataclass(eq=False)
 class Worker:
-    """A worker as the pool sees it: its scene (None: it is free), its simulator's task, and the scene's outcomes."""
+    """State of a worker: its scene (None: idle), the task of its simulator, and the outcomes of the scene so far."""
 
     work: SceneWork | None = None
     task: str = ""
@@ -72,29 +72,29 @@ W = TypeVar("W", bound=Worker)
 
 
 class Pool(Protocol[W]):
-    """Workers of one kind. One that died is replaced by the next `workers`."""
+    """Workers of one kind. The next call of `workers` replaces those that died."""
 
     def workers(self, wanted: int) -> Sequence[W]:
-        """Those alive, up to ``wanted`` of them where there is room."""
+        """The live workers, at most ``wanted``; starts new ones if there are free cores."""
         ...
 
     def give(self, worker: W, work: SceneWork) -> None:
-        """Have ``worker`` begin; that it died in the meantime is said by `receive`."""
+        """Send ``work`` to ``worker``; `receive` reports a worker that has died."""
         ...
 
     def receive(self, busy: Collection[W]) -> Iterator[tuple[W, Message]]:
-        """The next messages of any of ``busy``; none after a while of silence."""
+        """The next messages of the workers in ``busy``; may be empty."""
         ...
 
     def close(self) -> None:
-        """End all workers, also those at work."""
+        """End all workers, including busy ones."""
         ...
 
 
 def run_pool(pool: Pool[W], works: Iterable[SceneWork]) -> Iterator[Outcome]:
-    """Do ``works``. A worker that dies loses the execution under way; others do the rest of its scene.
+    """Do ``works``. A worker that dies loses its current execution; others do the rest of its scene.
 
-    Raises `RipError` with the words of an error that a worker met, or where a scene ends one worker after the other.
+    Raises the error of a worker as `RipError`, and `RipError` if `MAX_DEATHS` workers die in one scene.
     """
     agenda = Agenda(works)
     busy: list[W] = []
@@ -126,7 +126,7 @@ def run_pool(pool: Pool[W], works: Iterable[SceneWork]) -> Iterator[Outcome]:
 
 
 class Agenda:
-    """Scenes to hand out: a worker stays with its task, because a simulator takes seconds to start."""
+    """Queue of scenes. A worker stays with its task, because a simulator takes seconds to start."""
 
     def __init__(self, works: Iterable[SceneWork]):
         self._works = list(works)
@@ -136,7 +136,7 @@ class Agenda:
         return len(self._works)
 
     def next(self, own: str, elsewhere: Iterable[str]) -> SceneWork | None:
-        """The next scene for a worker whose simulator runs the task ``own``; tasks that run ``elsewhere`` come last."""
+        """The next scene for a worker whose simulator runs the task ``own``; tasks of other workers come last."""
         if not self._works:
             return None
         busy = set(elsewhere)
@@ -145,11 +145,11 @@ class Agenda:
         return best
 
     def put_back(self, work: SceneWork, cause: str) -> None:
-        """Have ``work`` done again, after its worker died of ``cause``; raises `RipError` when that is hopeless."""
+        """Queue ``work`` again after its worker died of ``cause``; raises `RipError` at the `MAX_DEATHS`-th death."""
         deaths = self._deaths[work.scene] = self._deaths.get(work.scene, 0) + 1
         if deaths >= MAX_DEATHS:
             raise RipError(
-                f"scene {work.scene} ended {deaths} workers, the last with {cause}; what was finished is kept: use "
-                "fewer --workers if memory ran out, and run the same command again to go on"
+                f"scene {work.scene} ended {deaths} workers, the last with {cause}; finished work is kept: use "
+                "fewer --workers if memory ran out, and run the same command again to continue"
             )
         self._works.insert(0, work)

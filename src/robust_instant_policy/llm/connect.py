@@ -57,10 +57,11 @@ def _parse(spec: str) -> tuple[str, Callable[[], LanguageModel]]:
         url, _, model = address.partition("#")
         try:
             parts = urlsplit(url)
-            is_whole = bool(parts.hostname and model) and parts.port != 0
-        except ValueError:  # no number, or too large a one, as the port
-            is_whole = False
-        if not is_whole:
+            if parts.port == 0:
+                raise ValueError("port 0 is no port of a server")
+        except ValueError as error:  # such as a port that is no number, or above 65535
+            raise UsageError(f"{url} is no address: {error}; write it as in http://localhost:8000/v1") from None
+        if not (parts.hostname and model):
             raise UsageError("an address needs its model behind a #, as in http://localhost:8000/v1#my-model")
         if parts.username is not None:
             raise UsageError("a key does not belong into the address; put it into the variable RIP_API_KEY")

@@ -1,4 +1,4 @@
-"""How servers differ within OpenAI's protocol: what they tell of themselves, and how each is asked."""
+"""Differences of servers within OpenAI's protocol: the facts that they report, and the form of requests."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from robust_instant_policy.llm.reply import as_map, as_text, token_count
 from robust_instant_policy.llm.transport import RefusedError
 from robust_instant_policy.query import Query
 
-CHAT_MARGINS = (64, 2048, 8192)  # tokens beside the numbers: for a few words, then for growing amounts of thinking
-OPTIONAL_FIELDS = ("seed", "stop", "temperature")  # left out when a server does not take them
+CHAT_MARGINS = (64, 2048, 8192)  # tokens beside the numbers: for a few words, then for more and more reasoning
+OPTIONAL_FIELDS = ("seed", "stop", "temperature")  # omitted if a server refuses them
 
 # The field that holds answers to the query's form, by kind of server. Sources: README of llama.cpp's server;
 # vLLM, Structured Outputs (0.12 and later); SGLang, Structured Outputs.
@@ -24,8 +24,8 @@ Style = Literal["chat", "completions"]
 
 @dataclass(frozen=True)
 class Server:
-    """What a server tells: its ``kind`` ("" when unknown), its context in tokens, and whether the model has a chat
-    template (None when it does not tell)."""
+    """Facts that a server reports: ``kind`` ("" if unknown), context in tokens, whether the model has a chat template
+    (None if unknown)."""
 
     kind: str = ""
     context_length: int | None = None
@@ -116,7 +116,7 @@ class Dialect:
             body["messages"] = [*system, {"role": "user", "content": query.text}]
         else:
             body["prompt"] = query.text
-            if query.stop and not self.margin:  # a chat model, or one that thinks, may begin with other lines
+            if query.stop and not self.margin:  # a chat or reasoning model may begin with other lines
                 body["stop"] = list(query.stop)
         if count > 1:
             body["n"] = count
@@ -128,7 +128,7 @@ class Dialect:
         return {name: value for name, value in body.items() if name not in self.left_out}
 
     def adapted(self, refusal: RefusedError, body: dict[str, Any]) -> Dialect | None:
-        """The dialect to use after ``refusal`` of ``body``; None when there is nothing left to change."""
+        """The dialect to use after ``refusal`` of ``body``; None if nothing is left to change."""
         complaint, words = refusal.complaint, refusal.complaint.message.lower()
         is_model_unknown = "model" in words and re.search(r"not found|not exist|no such|unknown|pull", words)
         if (refusal.status in (404, 405) and not is_model_unknown) or re.search(
@@ -156,5 +156,5 @@ class Dialect:
         return replace(self, style=other, tried=self.tried | {self.style})
 
     def with_more_room(self) -> Dialect | None:
-        """Room for more thinking; None at the largest."""
+        """More tokens for reasoning; None at the largest margin."""
         return replace(self, margin=self.margin + 1) if self.margin + 1 < len(CHAT_MARGINS) else None

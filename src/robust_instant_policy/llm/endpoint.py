@@ -33,10 +33,10 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 8.0  # between repeats; doubles from the 
 MAX_UNREACHABLE = 6  # refused connections in a row after which the server counts as absent, about 8 s
 FACTS_TIME_S = 10.0  # at most, for asking the server about itself
 MAX_CONCURRENT = 32  # requests under way at a time
-# A reply that counts fewer prompt tokens than this share of the estimate read only a part of the prompt. Tokenizers
-# with words for " 12" need half of the estimate, all others more.
+# If a reply counts fewer prompt tokens than this share of the estimate, the server cut the prompt. Tokenizers with a
+# token for " 12" need half of the estimate, all others more.
 TRUNCATED_SHARE = 0.45
-MIN_TOKENS_TO_TELL = 200  # below this the estimate is too coarse
+MIN_TOKENS_TO_COMPARE = 200  # below this the estimate is too coarse
 
 Result = TypeVar("Result")
 
@@ -60,10 +60,6 @@ class Endpoint:
     @property
     def context_length(self) -> int | None:
         return _run(self._facts()).context_length
-
-    @property
-    def counts_exactly(self) -> bool:
-        return _run(self._facts()).counts_tokens
 
     def count_tokens(self, text: str) -> int:
         async def count() -> int:
@@ -90,7 +86,7 @@ class Endpoint:
             return await self.learn(connection)
 
     async def learn(self, connection: Connection, time_s: float = FACTS_TIME_S) -> Server:
-        """What the server tells of itself within ``time_s``; what it did not tell is asked again the next time."""
+        """Facts that the server reports within ``time_s``; missing ones are requested again the next time."""
         if self._server is not None:
             return self._server
         end = time.monotonic() + min(time_s, FACTS_TIME_S)
@@ -116,7 +112,7 @@ class Endpoint:
         return self._server or Server()
 
     async def count(self, connection: Connection, server: Server, text: str) -> int:
-        """The server's own count of tokens, an estimate where it has none."""
+        """The server's count of tokens, an estimate if it cannot count."""
         if server.counts_tokens:
             is_llama = server.kind == "llamacpp"
             body = {"content": text, "add_special": True} if is_llama else {"model": self.name, "prompt": text}
@@ -139,10 +135,10 @@ class Endpoint:
     async def ask(
         self, connection: Connection, query: Query, count: int, temperature: float, seed: int, timeout_s: float
     ) -> Reply | None:
-        """One request for ``count`` answers; None when it has to be put differently (the dialect has changed).
+        """One request for ``count`` answers; None if the dialect has changed and the request must be made again.
 
-        Fewer come back from servers that do not know ``n``. Raises `UnavailableError`, and `ModelError` for a request
-        that will never succeed.
+        Servers that do not support ``n`` return fewer. Raises `UnavailableError`, and `ModelError` for a request that
+        cannot succeed.
         """
         used = self.dialect
         body = used.body(self.name, query, count, temperature, seed)
@@ -163,7 +159,7 @@ class Endpoint:
         return reply
 
     def make_room(self, used: Dialect, answer: Answer) -> None:
-        """Allow more tokens after ``answer`` was cut off; raise `ModelError` at the largest allowance."""
+        """Allow more tokens after ``answer`` was cut off; raises `ModelError` at the largest margin."""
         if self.dialect != used:
             return
         changed = used.with_more_room()
@@ -175,9 +171,9 @@ class Endpoint:
         self.dialect = changed
 
     def _adapt(self, used: Dialect, refusal: RefusedError, body: dict[str, Any]) -> None:
-        """Ask differently from now on, or raise `ModelError`.
+        """Change the dialect after a refusal, or raise `ModelError`.
 
-        Where another request has changed the dialect meanwhile, the refusal is out of date: asking again tells.
+        If another request has changed the dialect in the meantime, the refusal is out of date.
         """
         words = refusal.complaint.message
         if "context" in words.lower() and re.search(r"exceed|maximum|too long|length", words, re.IGNORECASE):
@@ -195,7 +191,7 @@ class Endpoint:
 
     def _refuse_truncated(self, query: Query, read: int) -> None:
         sent = estimate_tokens(query.text)
-        if sent >= MIN_TOKENS_TO_TELL and 0 < read < TRUNCATED_SHARE * sent:
+        if sent >= MIN_TOKENS_TO_COMPARE and 0 < read < TRUNCATED_SHARE * sent:
             raise ModelError(
                 f"{self.name} at {self.url} read only {read} of about {sent} tokens of the prompt; raise the server's "
                 "context (Ollama: OLLAMA_CONTEXT_LENGTH or num_ctx), or use fewer demonstrations or layout='factorised'"
@@ -291,19 +287,19 @@ class _Plan:
                         f"nothing answers at {self._endpoint.url} ({failure}); is the server running, and the address "
                         "right?"
                     ) from None
-                # A server that asks for no pause, or for less, is not asked faster than others.
+                # The pause is a lower bound, also if the server asks for a shorter one.
                 await asyncio.sleep(max(failure.wait_s, pause * random.uniform(0.5, 1.0)))
                 pause = min(2 * pause, LONGEST_PAUSE_S)
 
 
 def _first(errors: BaseExceptionGroup[RipError]) -> RipError:
-    """The first of the errors in a group, however deep groups are nested."""
+    """The first error in a group of errors, which may be nested."""
     first = errors.exceptions[0]
     return _first(first) if isinstance(first, BaseExceptionGroup) else first
 
 
 def _run(work: Coroutine[Any, Any, Result]) -> Result:
-    """Run to the end, also where an event loop is running already (a notebook)."""
+    """Run ``work``, also if an event loop is running already (a notebook)."""
     try:
         asyncio.get_running_loop()
     except RuntimeError:

@@ -47,10 +47,10 @@ def load_embedded() -> LlamaModel:
 
 
 def embedded_path() -> Path:
-    """The embedded model's file, made at the first use (about 10 s, 69 MB) and checked at every one.
+    """Path of the embedded model, which is written at the first use (about 10 s, 69 MB) and checked at every use.
 
-    Raises `MissingExtraError` when a package is not installed and `ModelError` when its parts are damaged, or when
-    other users could change the file.
+    Raises `MissingExtraError` if a package is not installed, and `ModelError` if its parts are damaged or other users
+    could change the file.
     """
     path = cache_folder() / f"{EMBEDDED_NAME}-1.gguf"
     try:
@@ -99,8 +99,8 @@ def _make(path: Path) -> None:
 def cut_vocabulary(source: Path, target: Path, keep: Callable[[str, int], bool]) -> None:
     """Write a copy of ``source`` to ``target`` with only the tokens for which ``keep(piece, type)`` is true.
 
-    Special tokens that the header names are always kept. ``target`` takes its name when it is whole. For models
-    with scored pieces and one embedding row each, without output weights of their own (SentencePiece: Gemma, Llama 2).
+    Special tokens in the header are always kept. ``target`` is replaced atomically. For models with scored pieces, one
+    embedding row each, and tied output weights (SentencePiece: Gemma).
 
     Of Gemma 3 270M's 268 million parameters 168 million are the embeddings of 262,144 tokens, and every sampled token
     scores all of them; text made of numbers uses a few hundred. Rows that are kept are kept bit for bit, so the scores

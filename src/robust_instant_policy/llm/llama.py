@@ -29,13 +29,13 @@ from robust_instant_policy.llm.reply import CUT_OFF, whole_numbers
 from robust_instant_policy.query import Answer, Query
 
 SHORT_TOKENS = 2048  # prompts up to this length, with their answers, run many at a time
-SLOT_STEP_TOKENS, LONG_STEP_TOKENS = 256, 4096  # short and long slots come in multiples of these
+SLOT_STEP_TOKENS, LONG_STEP_TOKENS = 256, 4096  # sizes of short and long slots are multiples of these
 COUNTED_PROMPTS = 3  # the longest, whose tokens are counted
 SHORT_SLOTS = 24  # over all cores; a plan has about ten prompts an arm
 MAX_SERVERS = 8  # more cores bring little to ten or twenty prompts
 PROGRESS_TOKENS = 128  # read between two checks of the deadline and of Ctrl-C, by each prompt
 MAX_CONTEXT_TOKENS = 32_768  # bounds the memory for models with a longer context
-FINGERPRINT_PIECES, PIECE_BYTES = 8, 1 << 20  # of a model file, evenly spaced, that tell it from others
+FINGERPRINT_PIECES, PIECE_BYTES = 8, 1 << 20  # of a model file, evenly spaced, for its digest
 _DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # the servers are in this process
 
 
@@ -67,7 +67,7 @@ class _Layout:
 
 @dataclass(eq=False)
 class _Deadline:
-    """When sampling stops; brought forward after an error."""
+    """The time at which sampling stops; an error sets it to the past."""
 
     at: float
 
@@ -78,7 +78,7 @@ class _Deadline:
 
 @dataclass(eq=False)
 class _Slot:
-    """A place in a server that caches the last text it read."""
+    """A slot of a server, with a cache of the last text that it read."""
 
     server: Any
     number: int
@@ -91,8 +91,6 @@ class LlamaModel:
 
     Without ``context_length`` (tokens) the model is loaded at once and llama.cpp is asked. Raises `ModelError`.
     """
-
-    counts_exactly = True
 
     def __init__(self, path: Path, name: str, context_length: int | None = None):
         if not path.is_file():
@@ -129,7 +127,7 @@ class LlamaModel:
         tally = Tally(len(queries), sampling, listener)
         if not queries or sampling.n < 1:
             return tally.answers()
-        with self._lock:  # two plans at a time would slow each other down
+        with self._lock:  # two plans at the same time would slow each other down
             layout = self._layout_for(queries)
             if layout != self._layout:
                 self._start(layout)
@@ -163,7 +161,7 @@ class LlamaModel:
                 raise
 
     def _assign(self, queries: Sequence[Query]) -> None:
-        """Give each query to the slot that has read most of it already, evenly over the slots."""
+        """Assign each query to the slot whose cache has most of it, evenly over the slots."""
         for slot in self._slots:
             slot.queue = []
         rounds = -(-len(queries) // len(self._slots))
@@ -181,7 +179,7 @@ class LlamaModel:
                 placed.add(index)
         for index in range(len(queries)):
             if index not in placed:
-                # The server with the least work first, so that all cores are busy to the end.
+                # the server with the least work, so that all cores are busy to the end
                 load: Counter[int] = Counter()
                 for slot in self._slots:
                     load[id(slot.server)] += len(slot.queue)
@@ -230,7 +228,7 @@ class LlamaModel:
         params.n_parallel = layout.slots
         params.kv_unified = False
         params.n_ctx = layout.tokens * layout.slots
-        # Layers with a sliding window forget what they read; a slot that is to go on from a prompt must not.
+        # Without it, layers with a sliding window drop their cache, and a slot cannot continue from a prompt.
         params.swa_full = True
         params.cache_ram_mib = 0
         threads = _free_cores() if layout.is_long else 1

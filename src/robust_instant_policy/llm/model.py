@@ -15,7 +15,7 @@ DEADLINE_S = 300.0  # wall time for all the answers of one plan; a busy laptop m
 MAX_ROUNDS = 8  # attempts at one sample before it is given up
 QUOTED_CHARS = 160  # of a refused answer, in messages
 
-Accept = Callable[[int, str], Any]  # query index, text -> what the answer says; None or False to refuse it
+Accept = Callable[[int, str], Any]  # query index, text -> parsed value; None or False to refuse the answer
 OnProgress = Callable[[int, int], None]  # accepted answers, wanted answers
 OnAnswer = Callable[[int, int, int, Answer, bool], None]  # query index, sample index, attempt, answer, accepted
 
@@ -40,8 +40,8 @@ class Sampling:
 class Listener:
     """Callbacks for answers as they arrive.
 
-    ``accept`` reads an answer once; its result becomes `Answer.value`. An answer for which it returns None (or False)
-    is refused and sampled again. ``on_answer`` gets every answer, the refused ones too.
+    ``accept`` parses an answer once; its result becomes `Answer.value`. An answer for which it returns None or False
+    is refused and sampled again. ``on_answer`` receives every answer, including refused ones.
     """
 
     accept: Accept | None = None
@@ -65,7 +65,7 @@ class LanguageModel(Protocol):
     """A model that continues text.
 
     ``name`` identifies its weights in the sample store. ``context_length`` is in tokens, None when the server does not
-    tell. ``counts_exactly`` tells whether `count_tokens` is the model's own count or an estimate.
+    tell. `count_tokens` estimates where the server has no tokenizer.
     """
 
     @property
@@ -73,9 +73,6 @@ class LanguageModel(Protocol):
 
     @property
     def context_length(self) -> int | None: ...
-
-    @property
-    def counts_exactly(self) -> bool: ...
 
     def count_tokens(self, text: str) -> int: ...
 

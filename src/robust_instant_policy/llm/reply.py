@@ -18,7 +18,7 @@ KEY_VARIABLES = ("OPENAI_API_KEY", "RIP_API_KEY")
 CUT_OFF = "cut off by the token limit"  # a fault of an answer
 MAX_ANSWER_CHARS = 1 << 18  # a hundred times the longest answer; the rest is not read
 MAX_MESSAGE_CHARS = 10_000  # of an error, likewise
-MAX_COUNT = 10**9  # a larger number of tokens is not believed
+MAX_COUNT = 10**9  # tokens; a larger number is ignored
 
 _ESCAPE = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[@-Z\\^_])")  # ANSI: CSI, OSC, others
 # How reasoning models mark their thinking: DeepSeek and Qwen, Magistral, and gpt-oss (harmony).
@@ -45,7 +45,7 @@ class Complaint:
 
 @dataclass(frozen=True)
 class Reply:
-    """Answers to one request. ``ran_out``: all were cut off by the token limit, ``thought``: or still thinking."""
+    """Answers to one request. ``ran_out``: all were cut off by the token limit; ``thought``: all in their reasoning."""
 
     answers: tuple[Answer, ...]
     ran_out: bool = False
@@ -53,7 +53,7 @@ class Reply:
 
 
 def read_json(content: bytes) -> Any:
-    """Raises `UnreadableReplyError` for what is no JSON, or nested too deeply."""
+    """Raises `UnreadableReplyError` for text that is not JSON or nested too deeply."""
     try:
         return json.loads(content)
     except RecursionError:
@@ -116,7 +116,7 @@ def read_reply(reply: object, count: int, seconds: float, counts_all: bool = Tru
 
 
 def _read_choice(choice: object) -> tuple[str, str, bool, bool]:
-    """Text, fault, whether the token limit cut it off, and whether it was still thinking."""
+    """Text, fault, whether the token limit cut it off, and whether it ended within the reasoning."""
     choice = as_map(choice)
     message = as_map(choice.get("message"))
     if "message" not in choice and not isinstance(choice.get("text"), str):
@@ -142,7 +142,7 @@ def _read_choice(choice: object) -> tuple[str, str, bool, bool]:
 
 
 def whole_numbers(text: str) -> str:
-    """What the token limit left of an answer, without its last number or word: that may lack its end."""
+    """A cut-off answer without its last number or word, which may be incomplete."""
     stop = len(text)
     while stop and (text[stop - 1].isalnum() or text[stop - 1] in "_.+-"):
         stop -= 1
@@ -165,7 +165,7 @@ def as_map(value: object) -> dict[str, Any]:
 
 
 def token_count(value: object) -> int | None:
-    """A number of tokens, None for everything that is none."""
+    """``value`` if it is a number of tokens, else None."""
     return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_COUNT else None
 
 
@@ -182,7 +182,7 @@ def clean(text: str) -> str:
 
 
 def one_line(words: str, length: int = 200) -> str:
-    """A server's words for a message: cleaned, one short line, without anything that looks like a key."""
+    """Text of a server as one short, clean line, without anything that looks like a key."""
     words = words[:MAX_MESSAGE_CHARS]
     for variable in KEY_VARIABLES:
         if key := os.environ.get(variable, "").strip():

@@ -1,4 +1,4 @@
-"""The sample store: every answer of every language model in one SQLite file, to record and to replay."""
+"""The sample store: all answers of all language models in one SQLite file, to record and to replay."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ CREATE TABLE IF NOT EXISTS failures (
   model TEXT NOT NULL, request TEXT NOT NULL, message TEXT NOT NULL, PRIMARY KEY (model, request)
 ) WITHOUT ROWID;
 """
-# The attempt number of a row without text: the sample was asked for, and no acceptable answer came. A replay then
-# misses it, too; a model is asked again.
-_NOTHING_CAME = 1_000_000
+# Attempt number of a row without text: the sample was requested, but no acceptable answer came in time. It is missing
+# in a replay, too; a model is asked again.
+_NO_ANSWER = 1_000_000
 
 
 @dataclass(frozen=True)
 class StoredCount:
-    """What a store holds of one model."""
+    """Numbers of queries, answers and tokens of one model in a store."""
 
     model: str
     queries: int
@@ -54,10 +54,10 @@ class StoredCount:
 
 
 class SampleStore:
-    """The SQLite file at ``path``, made when missing.
+    """The SQLite file at ``path``, created if missing.
 
-    Each answer is written as it arrives, in a transaction of its own: a killed process loses at most the answers under
-    way, and several processes may share a file.
+    Each answer is written when it arrives, in its own transaction: a killed process loses only answers that have not
+    arrived, and several processes may share a file.
     """
 
     def __init__(self, path: str | Path):
@@ -81,7 +81,7 @@ class SampleStore:
         self._db.close()
 
     def models(self) -> list[StoredCount]:
-        """What the store holds of each model."""
+        """The numbers for each model."""
         rows = self._select(
             "SELECT model, COUNT(DISTINCT query), COUNT(text), SUM(prompt_tokens), SUM(completion_tokens) "
             "FROM answers GROUP BY model ORDER BY model"
@@ -116,9 +116,9 @@ class SampleStore:
         return len(rows)
 
     def write(self, model: str, query: Query, settings: str, sample: int, attempt: int, answer: Answer | None) -> None:
-        """Keep one answer, or with None that no acceptable one came.
+        """Store one answer, or None if no acceptable one came.
 
-        What is there stays: another answer under the same number gets the next free one.
+        Stored answers stay: a different answer with the same attempt number gets the next free number.
         """
         digest = _digest(query)
         cost = (0, 0, 0, 0.0)
@@ -140,10 +140,7 @@ class SampleStore:
             )
 
     def take(self, other: str | Path) -> None:
-        """Copy what only the store at ``other`` holds, all of it or nothing.
-
-        Raises `UsageError` where ``other`` is not a store.
-        """
+        """Copy what is only in the store at ``other``, all or nothing. Raises `UsageError` if it is not a store."""
         if not Path(other).is_file():
             raise UsageError(f"no sample store at {other}")
         with self._lock:
@@ -160,7 +157,7 @@ class SampleStore:
                 raise UsageError(f"the samples of {other} cannot be copied to {self.path} ({error})") from None
 
     def read(self, model: str, query: Query, settings: str, sample: int) -> list[Answer | None]:
-        """All attempts at one sample, in order, and None last when no acceptable one came. Empty: never asked."""
+        """All attempts at one sample, in order, and None last if no acceptable one came. Empty: never requested."""
         rows = self._select(
             "SELECT text, prompt_tokens, cached_tokens, completion_tokens, seconds FROM answers "
             "WHERE model = ? AND query = ? AND settings = ? AND sample = ? ORDER BY attempt",
@@ -169,13 +166,13 @@ class SampleStore:
         return [None if row[0] is None else replace(Answer(*row), replayed=True) for row in rows]
 
     def write_failure(self, model: str, queries: Sequence[Query], sampling: Sampling, message: str) -> None:
-        """Keep the message with which a model failed; a replay fails with the same."""
+        """Store the message with which a model failed; a replay fails with the same message."""
         row = (model, _request_digest(queries, sampling), message)
         with self._locked():
             self._db.execute("INSERT OR REPLACE INTO failures VALUES (?, ?, ?)", row)
 
     def read_failure(self, model: str, queries: Sequence[Query], sampling: Sampling) -> str | None:
-        """The message of the last failure when these queries were asked together, None without one."""
+        """The message of the last failure of this request, None if there was none."""
         rows = self._select(
             "SELECT message FROM failures WHERE model = ? AND request = ?", (model, _request_digest(queries, sampling))
         )
@@ -187,7 +184,7 @@ class SampleStore:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Use the database alone; its errors become one line."""
+        """Lock the database, and convert its errors to one line."""
         try:
             with self._lock:
                 yield
@@ -198,7 +195,7 @@ class SampleStore:
 
 
 class RecordedModel:
-    """A language model whose answers are kept in a store and are not asked for twice."""
+    """A language model whose answers are stored and not requested twice."""
 
     def __init__(self, model: LanguageModel, store: SampleStore):
         self._model, self._store = model, store
@@ -208,26 +205,22 @@ class RecordedModel:
     def context_length(self) -> int | None:
         return self._model.context_length
 
-    @property
-    def counts_exactly(self) -> bool:
-        return self._model.counts_exactly
-
     def count_tokens(self, text: str) -> int:
         return self._model.count_tokens(text)
 
     def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
-        """See `LanguageModel.sample`; asks the model only for queries of which the store lacks a sample.
+        """See `LanguageModel.sample`; asks the model only for queries with a missing sample.
 
-        A sample that missed an earlier deadline is asked for again, one that was refused `MAX_ROUNDS` times is not.
+        A sample that missed an earlier deadline is requested again, one that was refused `MAX_ROUNDS` times is not.
         """
-        accept = None if listener.accept is None else functools.cache(listener.accept)  # each answer is read once
+        accept = None if listener.accept is None else functools.cache(listener.accept)  # parses each answer once
         found, unasked = _look_up(self._store, self.name, queries, sampling, replace(listener, accept=accept))
         if not unasked:
             return found
         asked, settings = [queries[index] for index in unasked], _settings(sampling)
 
         def keep(position: int, sample: int, attempt: int, answer: Answer, accepted: bool) -> None:
-            if answer.text or not answer.fault:  # an answer that was withheld is none to replay
+            if answer.text or not answer.fault:  # a withheld answer is not replayed
                 self._store.write(self.name, asked[position], settings, sample, attempt, answer)
             if listener.on_answer is not None:
                 listener.on_answer(unasked[position], sample, attempt, answer, accepted)
@@ -245,8 +238,8 @@ class RecordedModel:
         for query, answers in zip(asked, fresh, strict=True):
             if len(answers) < sampling.n:
                 for sample in sampling.indices:
-                    self._store.write(self.name, query, settings, sample, _NOTHING_CAME, None)
-        # What the store holds now, not what came: a sample that was there already stays what it was.
+                    self._store.write(self.name, query, settings, sample, _NO_ANSWER, None)
+        # From the store, because a sample that was stored before stays as it was.
         kept, _ = _look_up(self._store, self.name, queries, sampling, Listener(accept))
         for index in unasked:
             found[index] = [replace(answer, replayed=False) for answer in kept[index]]
@@ -257,12 +250,10 @@ class RecordedModel:
 
 
 class ReplayedModel:
-    """The answers that a store holds of the model ``name``, without the model.
+    """The stored answers of the model ``name``, without the model.
 
-    A model file's name without its digest will do, where only one file of that name was asked.
+    The digest in the name of a model file can be omitted if only one file of that name was asked.
     """
-
-    counts_exactly = False
 
     def __init__(self, store: SampleStore, name: str):
         known = store.names()
@@ -278,8 +269,7 @@ class ReplayedModel:
         return estimate_tokens(text)
 
     def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
-        """See `LanguageModel.sample`; raises what the model raised then, and `ModelError` for a sample that was never
-        recorded."""
+        """See `LanguageModel.sample`; raises the model's error again, and `ModelError` if a sample was not recorded."""
         found, unasked = _look_up(self._store, self.name, queries, sampling, listener, is_replay=True)
         if unasked:
             failure = self._store.read_failure(self.name, queries, sampling)
@@ -304,33 +294,38 @@ def _look_up(
     listener: Listener,
     is_replay: bool = False,
 ) -> tuple[list[list[Answer]], list[int]]:
-    """Stored answers to each query, and the indices of queries of which a sample has to be asked for.
+    """The stored, accepted answers to each query, and the indices of the queries for which a sample is missing.
 
-    In a replay a sample for which nothing came is not missing.
+    A sample for which no acceptable answer came is not missing in a replay, nor after `MAX_ROUNDS` refusals.
     """
     found: list[list[Answer]] = []
     unasked = []
-    settings = _settings(sampling)
     for index, query in enumerate(queries):
-        attempts = [store.read(model, query, settings, sample) for sample in sampling.indices]
-        heard = [[answer for answer in tries if answer is not None] for tries in attempts]
-        read = [next(filter(None, (listener.read(index, answer) for answer in tries)), None) for tries in heard]
-        found.append([answer for answer in read if answer is not None])
-        if any(
-            own is None and len(come) < MAX_ROUNDS and not (is_replay and None in tries)
-            for own, come, tries in zip(read, heard, attempts, strict=True)
-        ):
+        accepted, attempts, is_missing = [], [], False
+        for sample in sampling.indices:
+            stored = store.read(model, query, _settings(sampling), sample)
+            answers = [answer for answer in stored if answer is not None]
+            own = next(filter(None, (listener.read(index, answer) for answer in answers)), None)
+            if own is not None:
+                accepted.append(own)
+            elif len(answers) < MAX_ROUNDS and not (is_replay and None in stored):
+                is_missing = True
+            attempts.append((sample, answers, own))
+        found.append(accepted)
+        if is_missing:
             unasked.append(index)
         elif listener.on_answer is not None:
-            for sample, own, come in zip(sampling.indices, read, heard, strict=True):
-                for attempt, answer in enumerate(come):
-                    is_own = own == answer
-                    listener.on_answer(index, sample, attempt, own if is_own and own else answer, is_own)
+            for sample, answers, own in attempts:
+                for attempt, answer in enumerate(answers):
+                    if own is not None and answer == own:
+                        listener.on_answer(index, sample, attempt, own, True)
+                    else:
+                        listener.on_answer(index, sample, attempt, answer, False)
     return found, unasked
 
 
 def _settings(sampling: Sampling) -> str:
-    """The settings that decide an answer; the deadline is none of them."""
+    """The settings that decide an answer; the deadline does not."""
     return json.dumps({"seed": sampling.seed, "temperature": sampling.temperature}, sort_keys=True)
 
 

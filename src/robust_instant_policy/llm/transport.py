@@ -1,4 +1,4 @@
-"""HTTP with one server: the key, the proxy, bounded replies, and every failure in plain words."""
+"""HTTP with one server: the key, the proxy, the size limit of replies, and one-line errors."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _PASSING_WORDS = re.compile(r"overload|rate.?limit|capacity|too many|try again|u
 
 
 class UnavailableError(Exception):
-    """The request may succeed later. ``wait_s`` is the pause that the server asks for, ``absent`` says that nothing
-    listens at the address."""
+    """The request may succeed later. ``wait_s`` is the pause that the server asks for; ``absent``: no server listens at
+    the address."""
 
     def __init__(self, message: str, wait_s: float = 0.0, absent: bool = False):
         super().__init__(message)
@@ -65,7 +65,7 @@ class Connection:
             raise ModelError(
                 "SSL_CERT_FILE or SSL_CERT_DIR names no readable certificates; correct or unset it"
             ) from None
-        except (ImportError, ValueError):  # the error's words may hold a password
+        except (ImportError, ValueError):  # the message of the error may contain a password
             raise ModelError(
                 f"the proxy that the environment names for {url} cannot be used; give it as http://host:port, or "
                 "put the server into no_proxy"

@@ -32,26 +32,16 @@ def plan_waypoints(trajectory: Trajectory, arms: Sequence[Arm], execute_hz: floa
     Raises `UnreachableError` that names the first refused waypoint.
     """
     waypoints = gripper_poses(trajectory, arms)
-    schedule = _Schedule(np.stack([arm.home_pose for arm in arms]), 1 / execute_hz)
+    start = Motion.at_home(arms)
+    schedule = _Schedule(start, 1 / execute_hz)
     first = waypoints[0]
     over = first.copy()  # travel at the larger of the two heights, then descend
-    over[:, 2, 3] = np.maximum(schedule.poses[-1][:, 2, 3], first[:, 2, 3])
+    over[:, 2, 3] = np.maximum(start.poses[-1][:, 2, 3], first[:, 2, 3])
     for poses in (over, first):
         schedule.go(poses, 0, LEAD_IN_SPEED_M_S)
-    speed = min(arm.tool_speed for arm in arms)
-    for step, (poses, closed) in enumerate(zip(waypoints, trajectory.gripper_state > CLOSED, strict=True)):
-        if step:
-            schedule.go(poses, step, speed / 2)  # the cubic is up to twice as fast as its mean
-        if (closed != schedule.closed[-1]).any():
-            schedule.dwell(GRIPPER_SECONDS, closed)
+    schedule.visit(waypoints, trajectory.gripper_state > CLOSED, arms, already_at_first=True)
     schedule.dwell(SETTLE_SECONDS, schedule.closed[-1])
-
-    end = schedule.times[-1]
-    at = np.arange(0.0, end + 0.5 / rate_hz, 1 / rate_hz).clip(max=end)
-    arriving = np.searchsorted(schedule.times, at, side="left").clip(max=len(schedule.times) - 1)
-    leaving = (np.searchsorted(schedule.times, at, side="right") - 1).clip(min=0)
-    path = _interpolate(np.array(schedule.times), np.array(schedule.poses), at)
-    closed, steps = np.array(schedule.closed)[leaving], np.array(schedule.steps)[arriving]
+    path, closed, steps = schedule.sampled(rate_hz, from_step=0)
     return plan_poses(path, closed, arms, rate_hz, steps)
 
 
@@ -60,32 +50,38 @@ def plan_onward(
 ) -> Motion:
     """Motion from the end of ``before`` through ``waypoints (N, 10·A)``, one every ``1 / waypoint_hz`` seconds.
 
-    Segments above the tool's speed limit take longer; there is no dwell on gripper changes.
-    Raises `UnreachableError` like `plan_waypoints`.
+    Segments above the tool's speed limit take longer, and there is the dwell of `plan_waypoints` at gripper changes,
+    so that closed and open loop give the fingers the same time. Raises `UnreachableError` like `plan_waypoints`.
     """
     trajectory = Trajectory.from_actions(waypoints)
-    knots = np.concatenate([before.poses[-1:], gripper_poses(trajectory, arms)])
-    distance = np.linalg.norm(np.diff(knots[:, :, :3, 3], axis=0), axis=2)
-    slowest = (distance / [arm.tool_speed / 2 for arm in arms]).max(axis=1)
-    seconds = np.maximum(1 / waypoint_hz, slowest)
-    ends = np.cumsum(np.maximum(np.round(seconds * rate_hz), 1)).astype(int)
-    at = np.arange(1, ends[-1] + 1)
-    steps = np.searchsorted(ends, at)
-    closed = trajectory.gripper_state[steps] > CLOSED
-    return plan_poses(_interpolate(np.append(0, ends), knots, at), closed, arms, rate_hz, steps, before)
+    schedule = _Schedule(before, 1 / waypoint_hz)
+    schedule.visit(gripper_poses(trajectory, arms), trajectory.gripper_state > CLOSED, arms)
+    path, closed, steps = schedule.sampled(rate_hz, from_step=1)
+    return plan_poses(path, closed, arms, rate_hz, steps, before)
 
 
 class _Schedule:
-    """Tool poses ``(A, 4, 4)`` at increasing times, from ``start`` at time 0 with open grippers.
+    """Tool poses ``(A, 4, 4)`` at increasing times, from the end of the motion ``before`` at time 0.
 
     ``interval`` is the time between waypoints in seconds; ``closed (A,)`` the gripper command from each time on;
     ``steps`` the waypoint index of each set of poses.
     """
 
-    def __init__(self, start: FloatArray, interval: float):
+    def __init__(self, before: Motion, interval: float):
         self._interval = interval
-        self.times, self.poses, self.steps = [0.0], [start], [0]
-        self.closed: list[np.ndarray] = [np.zeros(len(start), dtype=bool)]
+        self.times, self.poses, self.steps = [0.0], [before.poses[-1]], [0]
+        self.closed: list[np.ndarray] = [before.closed[-1]]
+
+    def visit(
+        self, waypoints: FloatArray, closed: np.ndarray, arms: Sequence[Arm], already_at_first: bool = False
+    ) -> None:
+        """Move through ``waypoints (N, A, 4, 4)``, with a dwell at each where a state of ``closed (N, A)`` changes."""
+        speed = min(arm.tool_speed for arm in arms) / 2  # the cubic is up to twice as fast as its mean
+        for step, (poses, wanted) in enumerate(zip(waypoints, closed, strict=True)):
+            if step or not already_at_first:
+                self.go(poses, step, speed)
+            if (wanted != self.closed[-1]).any():
+                self.dwell(GRIPPER_SECONDS, wanted)
 
     def go(self, poses: FloatArray, step: int, speed: float) -> None:
         """Move to ``poses`` in one interval, or longer if that would exceed ``speed`` m/s."""
@@ -96,6 +92,17 @@ class _Schedule:
         """Stay for ``seconds``, with the gripper command ``closed (A,)`` from the start."""
         self.closed[-1] = closed
         self._add(self.poses[-1], seconds, self.steps[-1])
+
+    def sampled(self, rate_hz: float, from_step: int) -> tuple[FloatArray, np.ndarray, np.ndarray]:
+        """Poses ``(M, A, 4, 4)``, gripper commands ``(M, A)`` and next waypoints ``(M,)``, at ``rate_hz`` from the time
+        ``from_step / rate_hz`` on."""
+        end = self.times[-1]
+        at = np.arange(from_step, np.floor(end * rate_hz + 0.5 - 1e-9) + 1) / rate_hz
+        at = at.clip(max=end)
+        arriving = np.searchsorted(self.times, at, side="left").clip(max=len(self.times) - 1)
+        leaving = (np.searchsorted(self.times, at, side="right") - 1).clip(min=0)
+        path = _interpolate(np.array(self.times), np.array(self.poses), at)
+        return path, np.array(self.closed)[leaving], np.array(self.steps)[arriving]
 
     def _add(self, poses: FloatArray, seconds: float, step: int) -> None:
         self.times.append(self.times[-1] + seconds)

@@ -4,10 +4,11 @@ import importlib
 import warnings
 
 from robust_instant_policy.perception.accuracy import Accuracy, KnownScene, measure
-from robust_instant_policy.perception.keypoints import KeypointExtractor, Located
+from robust_instant_policy.perception.keypoints import CORRESPONDENCES, KeypointExtractor, Located
 from robust_instant_policy.perception.settings import PAPER_REAL, PAPER_SIMULATION, DescriptorSettings
 
 __all__ = [
+    "CORRESPONDENCES",
     "PAPER_REAL",
     "PAPER_SIMULATION",
     "Accuracy",

@@ -30,6 +30,7 @@ class EfficientNetDescriptors:
     """
 
     salient = 0.5
+    buddy_saliency = 0.85  # for best buddies: objects are above it, the wood grain of a table below
 
     def __init__(self, settings: DescriptorSettings, network: Any = None, name: str = NETWORK):
         self.name = name

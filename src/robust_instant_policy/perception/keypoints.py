@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import InvalidValueError, KeypointError
+from robust_instant_policy.errors import InvalidValueError, KeypointError, UnknownNameError
 from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
+from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.objects import (
     MIN_FITNESS,
@@ -29,6 +30,7 @@ from robust_instant_policy.perception.settings import DescriptorSettings, paper_
 from robust_instant_policy.perception.view import View, make_view
 from robust_instant_policy.trajectory import Trajectory
 
+CORRESPONDENCES = ("registration", "nearest")
 SAME_SHAPE_FITNESS = 0.7  # from which keypoints need no registration of their own
 SCENERY_WEIGHT = 0.2  # of what never moves, beside what does
 NEIGHBOURHOOD_M = 0.04  # around a keypoint, for a registration of its own
@@ -51,7 +53,8 @@ class KeypointExtractor:
 
     ``num_keypoints``: K. ``features``: see `choose_network`. ``workspace (2, 3)``: lower and upper corner in metres,
     world; points outside are ignored. ``settings``: by default the paper's for images of the first one's size.
-    Deterministic for a ``seed``.
+    ``correspondence``: "registration" of objects, or "nearest" as published: best buddies and nearest neighbours (see
+    `perception.nearest`), which uses no workspace. Deterministic for a ``seed``.
 
     After `fit`: ``keypoints_ (I, K, 3)`` metres, world, and ``pixels_ (I, K, 2)`` (u, v) of I demonstrations;
     ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``notes_`` for the user, one line each.
@@ -64,7 +67,10 @@ class KeypointExtractor:
         workspace: ArrayLike | None = None,
         seed: int = 0,
         settings: DescriptorSettings | None = None,
+        correspondence: str = "registration",
     ):
+        if correspondence not in CORRESPONDENCES:
+            raise UnknownNameError("correspondence", correspondence, CORRESPONDENCES)
         if num_keypoints < 1:
             raise InvalidValueError(f"num_keypoints must be at least 1, got {num_keypoints}")
         self.num_keypoints = num_keypoints
@@ -72,6 +78,8 @@ class KeypointExtractor:
         self.workspace = None if workspace is None else np.asarray(workspace, dtype=np.float64).reshape(2, 3)
         self.seed = seed
         self.settings = settings
+        self.correspondence = correspondence
+        self._shared: SharedDescriptors | None = None
 
     def fit(
         self, observations: Sequence[Observation], trajectories: Sequence[Trajectory] | None = None
@@ -79,14 +87,16 @@ class KeypointExtractor:
         """Choose keypoints and find them in ``observations``, the demonstrations' first images.
 
         With the demonstrations' ``trajectories`` the keypoints lie on what the hand approaches, grasps or moves
-        relative to, otherwise on all objects. Raises `KeypointError` where the images have too little in common, or depth or
-        foreground are missing.
+        relative to, otherwise on all objects (and always with nearest neighbours). Raises `KeypointError` where the
+        images have too little in common, or depth or foreground are missing.
         """
         if not observations:
             raise KeypointError("no demonstrations were given; record at least one")
         settings = self.settings or paper_settings(*observations[0].rgb.shape[:2])
         self.network_, note = choose_network(self.features, settings)
         self.descriptor_name_ = self.network_.name
+        if self.correspondence == "nearest":
+            return self._fit_nearest(observations, note)
         views = [make_view(observation, self.network_, self.workspace, self.seed) for observation in observations]
         notes = [note, *dict.fromkeys(line for view in views for line in view.notes)]
         if len(views) == 1:
@@ -120,11 +130,26 @@ class KeypointExtractor:
         self.notes_ = tuple(notes)
         return self
 
+    def _fit_nearest(self, observations: Sequence[Observation], note: str) -> KeypointExtractor:
+        images = [Image.of(observation, self.network_) for observation in observations]
+        self._shared, notes = share_descriptors(images, self.num_keypoints, self.seed)
+        self.objects_ = []
+        self.notes_ = (note, *notes)
+        found = [
+            (image.points(cells), image.pixels(cells)) for image, cells in zip(images, self._shared.cells, strict=True)
+        ]
+        self.keypoints_, self.pixels_ = (np.stack(of_images) for of_images in zip(*found, strict=True))
+        return self
+
     def locate(self, observation: Observation) -> Located:
         """The keypoints in a new image.
 
         Raises `KeypointError` where depth or foreground are missing.
         """
+        if self._shared is not None:
+            image = Image.of(observation, self.network_)
+            cells, similarity = self._shared.find(image)
+            return Located(image.points(cells), image.pixels(cells), similarity)
         view = make_view(observation, self.network_, self.workspace, self.seed)
         return self._locate(view, register_all([thing.model for thing in self.objects_], view))
 

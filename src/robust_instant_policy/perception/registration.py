@@ -119,9 +119,9 @@ def refine(motions: FloatArray, source: Float32Array, target: Float32Array, simi
     """
     centre = source[:, :3].mean(axis=0)
     starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
-    starts, fitness = icp(starts, *_coarse(source, target), COARSE_REACH_M)
+    starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M)
     leading = np.argsort(-fitness - similarity(starts))[:FINALISTS]
-    finalists, fitness = icp(starts[leading], source, target, FINE_REACH_M)
+    finalists, fitness = icp(starts[leading], source, _around(starts[leading], source, target), FINE_REACH_M)
     similarities = similarity(finalists)
     order = np.argsort(-fitness - similarities, kind="stable")
     return Candidates(finalists[order], fitness[order], similarities[order])
@@ -131,6 +131,7 @@ def settle_turn(motion: FloatArray, source: Float32Array, target: Float32Array, 
     """``motion (4, 4)``, turned to the descriptors' mean rotation if points do not determine it, as for a disc."""
     centre = source[:, :3].mean(axis=0)
     alternatives = rotated(motion, centre, SMALL_TURNS)
+    target = _around(motion[None], source, target)
     fitness = icp(alternatives, *_coarse(source, target), ())[1]
     if fitness.min() <= fitness[len(alternatives) // 2] - MAX_SYMMETRY_LOSS:
         return motion
@@ -145,7 +146,7 @@ def find_rivals(motion: FloatArray, source: Float32Array, target: Float32Array, 
     turned = rotated(motion, centre, LARGE_TURNS)
     slid = np.repeat(motion[None], len(SLIDES_M), axis=0)
     slid[:, :3, 3] += SLIDES_M
-    coarse = _coarse(source, target)
+    coarse = _coarse(source, _around(motion[None], source, target))
     turned = icp(turned, *coarse, RIVAL_REACH_M)[0]
     motions = np.concatenate([motion[None], turned, slid])
     return Candidates(motions, icp(motions, *coarse, ())[1], similarity(motions))
@@ -154,7 +155,8 @@ def find_rivals(motion: FloatArray, source: Float32Array, target: Float32Array, 
 def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
     """How an object of the same kind differs in size: an affine map ``(4, 4)`` of its own frame, before ``motion``.
 
-    It stretches ``source (N, 3)`` along its horizontal axes, and lifts it, to the extent of the points ``goals (M, 3)``.
+    It stretches ``source (N, 3)`` along its horizontal axes, and lifts it, to the extent of the image's points of it,
+    ``goals (M, 3)``.
     """
     goals = transform_points(invert_pose(motion), goals)
     shape = np.eye(4)
@@ -177,6 +179,15 @@ def horizontal_axes(points: FloatArray) -> FloatArray:
     turns = rotations_about_vertical(np.deg2rad(np.arange(0.0, 90.0, 3.0)))
     extent = np.diff(np.percentile(points @ np.swapaxes(turns, 1, 2), EXTENT_PERCENTILES, axis=1), axis=0)[0]
     return turns[(extent[:, 0] * extent[:, 1]).argmin()]
+
+
+def _around(motions: FloatArray, source: Float32Array, target: Float32Array) -> Float32Array:
+    """Those of ``target (M, 6)`` that ``source (N, 6)`` may reach from ``motions (C, 4, 4)``; at least one."""
+    centre = source[:, :3].mean(axis=0)
+    reach = np.linalg.norm(source[:, :3] - centre, axis=1).max() + max(COARSE_REACH_M)
+    places = motions[:, :3, :3] @ centre + motions[:, :3, 3]
+    near = (np.linalg.norm(target[:, None, :3] - places, axis=2) < reach).any(axis=1)
+    return target[near] if near.any() else target[:1]
 
 
 def _coarse(source: Float32Array, target: Float32Array) -> tuple[Float32Array, Float32Array]:

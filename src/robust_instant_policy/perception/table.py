@@ -23,7 +23,7 @@ MAX_ABOVE_M = 0.8  # of what stands on a table
 @dataclass(frozen=True, eq=False)
 class Table:
     """``plane (4,)``: unit normal, upward, and offset; ``noise``: standard deviation of its points, metres;
-    ``on (N, 2)`` and ``off (M, 2)``: places in the plane where rays meet the table and where they pass beside it, metres.
+    ``on (N, 2)`` and ``off (M, 2)``: places in the plane, metres, where rays meet the table or pass beside it.
     """
 
     plane: FloatArray

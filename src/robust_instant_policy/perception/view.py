@@ -42,7 +42,7 @@ HIDDEN_GAP_M = 0.020  # nor those of such pixels this near in a horizontal direc
 MIN_PIECE_POINTS = 15
 MIN_TOLD_POINTS = 8  # smaller pieces are noise
 MAX_TOLD = 3
-MAX_PIECE_POINTS = 500  # of a piece, in `View.target`
+TARGET_M = 0.005  # edge of the cubes with one point each in `View.target`
 COLOUR_SCALE_M = 0.06  # metres in an XYZRGB point for the difference between black and white in one channel
 MIN_TILT_RAD = np.deg2rad(1.0)  # of the table in the world; less is the noise of its plane
 BORDER_SHARE = 0.01  # of the image's width and height, at its border
@@ -67,7 +67,7 @@ class View:
     """An ``observation``, its ``descriptors``, its ``depth (H, W)`` in metres, and its foreground.
 
     The world of a view is level: ``to_world (4, 4)`` maps it to the world of the given camera pose, from which it
-    differs where that is tilted. Foreground: ``points (N, 3)`` in metres; the same as ``xyzrgb (N, 6)`` in metres, colours in
+    differs where that is tilted. Foreground: ``points (N, 3)`` in metres; the same as ``xyzrgb (N, 6)``, colours in
     units of `COLOUR_SCALE_M`; ``pieces``, the points' numbers by connected piece; ``target (M, 6)``, a sample of
     ``xyzrgb`` to which objects are registered; ``cells (C,)`` of the descriptor map: first those with foreground,
     whose mean points are ``cell_points (F, 3)``, then their neighbours. ``labels (h, w)``, subsampled by ``stride``: a
@@ -96,8 +96,8 @@ def make_view(
 
     A point is foreground by its height above the table, or, when flat, by the network's saliency and a colour that
     differs from the table's. What is below or beside the table, outside ``workspace (2, 3)`` (metres, world; its lower
-    z is ignored), or reaches in over the border is not. Raises `KeypointError` for intrinsics of another resolution, and
-    for too few depth readings or foreground points.
+    z is ignored), or reaches in over the border is not. Raises `KeypointError` for intrinsics of another resolution,
+    and for too few depth readings or foreground points.
     """
     _check_resolution(observation)
     depth, note = in_metres(observation.depth)
@@ -121,7 +121,8 @@ def make_view(
     label = np.full(len(points), TABLE)
     label[_unlike_table(observation, descriptors, pixels, heights, table, network.salient)] = 0
     label[heights < -table.least_height] = BELOW
-    label[(label == 0) & table.beside(points)] = BESIDE
+    standing = np.flatnonzero(label == 0)
+    label[standing[table.beside(points[standing])]] = BESIDE
     label[(label == 0) & (heights > TALLEST_M)] = HIGH
     label[~inside | ((label == 0) & (points[:, 2] > upper[2]))] = OUTSIDE
 
@@ -146,7 +147,8 @@ def make_view(
     points, label = points[kept], label[kept]
     xyzrgb = np.concatenate([points, colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
     pieces = tuple(np.flatnonzero(label == piece) for piece in range(label.max() + 1))
-    target = xyzrgb[np.concatenate([subsample(piece, MAX_PIECE_POINTS, seed) for piece in pieces])]
+    # Of equal density: near or separate things have no more weight than others.
+    target = xyzrgb[np.unique(np.floor(points / TARGET_M).astype(int), axis=0, return_index=True)[1]]
     cells, inverse, counts = np.unique(descriptors.cells_at(pixels[kept]), return_inverse=True, return_counts=True)
     cell_points = np.stack([np.bincount(inverse, axis) for axis in points.T], axis=1) / counts[:, None]
     neighbours = np.setdiff1d([descriptors.shifted(cells, row, col) for row, col in NEIGHBOURS], cells)

@@ -15,7 +15,14 @@ from robust_instant_policy.policies.catalogue import (
     make_policy,
     make_trained_policy,
 )
-from robust_instant_policy.policies.context import Context, LocatedScene, build_context, locate
+from robust_instant_policy.policies.context import (
+    Context,
+    LocatedScene,
+    build_context,
+    context_of_keypoints,
+    locate,
+    scene_of_keypoints,
+)
 from robust_instant_policy.policies.gp import KeypointRegression
 from robust_instant_policy.policies.instant import KeypointActionTokens
 from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
@@ -23,11 +30,12 @@ from robust_instant_policy.policies.neighbours import Neighbours
 from robust_instant_policy.policies.policy import ClosedLoopPolicy, Plan, Policy, Progress, Stage, Usage
 from robust_instant_policy.policies.rip import RobustInstantPolicy
 from robust_instant_policy.policies.sampling import Proposal, Samples, propose, sample
-from robust_instant_policy.policies.settings import Settings
+from robust_instant_policy.policies.settings import CONFIGS, Settings
 from robust_instant_policy.policies.training import Training
 
 __all__ = [
     "ASKING_METHODS",
+    "CONFIGS",
     "IMAGE_METHODS",
     "METHOD_NAMES",
     "REGRESSING_METHODS",
@@ -51,11 +59,13 @@ __all__ = [
     "Usage",
     "aggregate",
     "build_context",
+    "context_of_keypoints",
     "locate",
     "make_policy",
     "make_trained_policy",
     "propose",
     "sample",
+    "scene_of_keypoints",
 ]
 
 _RENAMED = {"KeypointContext": "Settings", "InstantPolicy": "KeypointActionTokens"}

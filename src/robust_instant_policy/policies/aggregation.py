@@ -8,12 +8,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.errors import InvalidValueError, PlanningError
-from robust_instant_policy.policies.confidence import UNKNOWN_NOTE, Evidence, novelty, plan_confidence
+from robust_instant_policy.policies.confidence import (
+    UNKNOWN_NOTE,
+    Evidence,
+    distortion,
+    doubts,
+    novelty,
+    plan_confidence,
+    prediction,
+)
 from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.policy import Plan, Stage, Stopwatch, Usage
 from robust_instant_policy.policies.sampling import Proposal
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.regression import RobustTrajectory, robust_gripper_trajectory
+from robust_instant_policy.sanity import errors
 from robust_instant_policy.trajectory import Trajectory
 
 
@@ -81,14 +90,20 @@ def make_plan(
     """
     trajectory = Trajectory(chosen.actions, chosen.times)
     outside = context.report.envelope.check(trajectory) if context.report.envelope is not None else ()
-    evidence = Evidence.of(
-        chosen.confidence,
-        scene.located.confidence,
-        context.prediction_errors,
-        novelty(context.keypoints, scene.keypoints),
-        (*context.report.findings, *scene.findings, *outside),
+    findings = (*context.report.findings, *scene.findings, *outside)
+    evidence = Evidence(
+        agreement=chosen.confidence,
+        distortion=distortion(context.keypoints, scene.keypoints),
+        prediction=prediction(context.prediction_errors),
+        novelty=novelty(context.keypoints, scene.keypoints),
+        displacement=context.surroundings.displacement(scene.view, chosen.actions) if scene.view else float("nan"),
+        precision=context.surroundings.precision,
+        doubts=doubts(findings),
+        warnings=sum(finding.severity == "warning" for finding in findings) - doubts(findings),
+        errors=len(errors(findings)),
     )
     unknown = (UNKNOWN_NOTE,) if judged and not evidence.is_known else ()
+    beside = (evidence.displacement_note,) if evidence.features()["displacement"] else ()
     return Plan(
         trajectory=trajectory,
         candidates=proposal.candidates,
@@ -103,5 +118,5 @@ def make_plan(
         pixels=scene.located.pixels,
         keypoint_confidence=scene.located.confidence,
         usage=Usage((scene.stage, *proposal.stages, *stages)),
-        notes=(*context.notes, *scene.notes, *proposal.notes, *map(str, outside), *unknown),
+        notes=(*context.notes, *scene.notes, *proposal.notes, *map(str, outside), *beside, *unknown),
     )

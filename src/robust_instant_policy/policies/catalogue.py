@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 MAX_ADAPTIVE_QUERIES = 10  # limit of rip-adaptive, unless more are asked for
 
-METHOD_NAMES = ("rip", "rip-gauss", "rip-adaptive", "kat", "dp", "kat-dp", "neighbours", "gp")
-ASKING_METHODS = ("rip", "rip-gauss", "rip-adaptive", "kat")  # those that ask the language model
+METHOD_NAMES = ("rip", "rip-gauss", "mean", "rip-adaptive", "kat", "dp", "kat-dp", "neighbours", "gp")
+ASKING_METHODS = ("rip", "rip-gauss", "mean", "rip-adaptive", "kat")  # those that ask the language model
 REGRESSING_METHODS = ("rip", "rip-gauss", "rip-adaptive")  # those that have a ν
 TRAINED_METHODS = ("dp", "kat-dp")  # those that take minutes or hours to fit
 IMAGE_METHODS = ("dp",)  # those whose demonstrations need images of the whole episode
@@ -51,6 +51,8 @@ def make_policy(
         return KeypointActionTokens(llm, settings, deadline_s=deadline_s)
     if name == "rip-gauss":
         settings = replace(settings, dof=math.inf)
+    elif name == "mean":
+        settings = replace(settings, estimator="mean")
     elif name == "rip-adaptive":
         settings = replace(settings, adaptive=True, num_queries=max(settings.num_queries, MAX_ADAPTIVE_QUERIES))
     return RobustInstantPolicy(llm, settings, deadline_s=deadline_s)

@@ -16,9 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.sanity import Finding, errors
+from robust_instant_policy.sanity import Finding
 
-COEFFICIENTS = {"constant": 4.1, "keypoints": 0.93, "prediction": 0.53, "novelty": 0.85, "warnings": 0.66}
+COEFFICIENTS = {
+    "constant": 3.21, "distortion": 0.92, "prediction": 1.23, "novelty": 1.33, "displacement": 1.33, "precision": 1.8,
+    "doubts": 4.19, "warnings": 0.83,
+}  # fmt: skip
 UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
 
 UNKNOWN_NOTE = (
@@ -27,63 +30,66 @@ UNKNOWN_NOTE = (
 )
 
 RECOGNISED = 0.5  # confidence of keypoints from which on a scene counts as recognised; 0.7 to 0.8 is usual
-GOOD_KEYPOINTS = 0.8  # above which more says nothing
-GOOD_PREDICTION_M = 0.010  # below which demonstrations predict each other as well as keypoints are measured
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
-LEAST = 1e-3  # of a ratio whose logarithm is taken
+# Up to these values evidence says nothing: sound scenes have them.
+GOOD_DISTORTION = 2.0
+GOOD_PREDICTION_M = 0.015
+GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT = 0.015, 1.5  # or that many times the demonstrations' own
+GOOD_PRECISION_M = 0.025
 LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one scene
+NOISE_M = 0.02  # variation of a coordinate below which it says nothing about a scene
+RIGID_M = 0.010  # variation of the distance of two keypoints below which they belong to one rigid thing
+DISTANCE_M = 0.003  # with which a distance between keypoints is measured
+RECORDING = {"gripper state", "grasp", "rotation"}  # kinds of findings
+MIN_SCENES = 3  # below which nothing is known of their variation
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What speaks for or against a plan.
+    """What speaks for or against a plan. NaN is unknown.
 
-    ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``keypoints`` in [0, 1], the lower
-    quartile of their confidence; ``prediction`` in metres, the median over the demonstrations of the worst error with
-    which the others predict one (`leave_one_out`); ``novelty``, how far the scene lies from the demonstrations (see
-    `novelty`); ``warnings`` and ``errors``, how many findings of the checks there are. NaN is unknown.
+    ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``distortion`` of the distances between
+    keypoints (see `distortion`); ``prediction``, metres, the error with which demonstrations predict each other at the
+    key step at which they do so best (see `prediction`); ``novelty``, how far the scene lies from the demonstrations
+    (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and ``precision``, that
+    of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording (`doubts`), other
+    ``warnings``, and ``errors``.
     """
 
     agreement: float
-    keypoints: float
+    distortion: float
     prediction: float
     novelty: float
+    displacement: float
+    precision: float
+    doubts: int
     warnings: int
     errors: int
-
-    @classmethod
-    def of(
-        cls,
-        agreement: float,
-        keypoint_confidence: FloatArray,
-        prediction_errors: FloatArray,
-        novelty: float,
-        findings: Sequence[Finding],
-    ) -> Evidence:
-        """``keypoint_confidence (K,)``; ``prediction_errors (I, S)`` in metres, of S key steps."""
-        return cls(
-            agreement,
-            float(np.quantile(keypoint_confidence, 0.25)),
-            float(np.median(prediction_errors.max(axis=1))),
-            novelty,
-            sum(finding.severity == "warning" for finding in findings),
-            len(errors(findings)),
-        )
 
     @property
     def is_known(self) -> bool:
         """Whether the demonstrations tell how well they predict a new scene."""
         return bool(np.isfinite(self.prediction) and np.isfinite(self.novelty))
 
+    @property
+    def displacement_note(self) -> str:
+        return (
+            f"warning: around the planned gripper the image shows what lies {self.displacement * 1e3:.0f} mm beside it "
+            f"in the demonstrations (theirs differ by {self.precision * 1e3:.0f} mm): were the keypoints found rightly?"
+        )
+
     def features(self) -> Mapping[str, float]:
         """f_j by name; 0 for what is not known."""
-        known = self.is_known
-        return {
-            "keypoints": float(np.log(np.clip(self.keypoints / GOOD_KEYPOINTS, LEAST, 1.0))),
-            "prediction": -float(np.log(max(self.prediction / GOOD_PREDICTION_M, 1.0))) if known else 0.0,
-            "novelty": -float(np.log(max(self.novelty, 1.0))) if known else 0.0,
-            "warnings": -float(self.warnings),
+        found = {
+            "distortion": self.distortion / GOOD_DISTORTION,
+            "prediction": self.prediction / GOOD_PREDICTION_M,
+            "novelty": self.novelty,
+            "displacement": self.displacement
+            / max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision))),
+            "precision": self.precision / GOOD_PRECISION_M,
         }
+        ratios = {name: -float(np.log(max(ratio, 1.0))) for name, ratio in found.items() if np.isfinite(ratio)}
+        return {**dict.fromkeys(found, 0.0), **ratios, "doubts": -float(self.doubts), "warnings": -float(self.warnings)}
 
 
 def plan_confidence(evidence: Evidence) -> float:
@@ -95,20 +101,73 @@ def plan_confidence(evidence: Evidence) -> float:
     return probability if evidence.is_known else min(probability, UNKNOWN)
 
 
-def novelty(demonstrated: FloatArray, keypoints: FloatArray) -> float:
-    """How far a scene lies from the demonstrations: distance to the nearest one, over their usual distance.
+def doubts(findings: Sequence[Finding]) -> int:
+    """How many ``findings`` are warnings that gripper states, grasps or rotations were recorded wrongly."""
+    return sum(f.severity == "warning" and f.kind in RECORDING and bool(f.cause) for f in findings)
 
-    ``demonstrated (I, K, 3)`` and ``keypoints (K, 3)`` in metres; distances are rms over keypoints. 1 is usual; NaN for
-    one demonstration, or where all show one scene.
+
+def prediction(errors: FloatArray) -> float:
+    """Metres, from the errors ``(I, S)`` of `leave_one_out`: the median over the demonstrations at the best key step.
+
+    The best, because demonstrators are precise where the gripper meets a thing and vary freely elsewhere. The first and
+    the last step count only where there are no others.
     """
-    if len(demonstrated) < 2:
+    between = errors[:, 1:-1] if errors.shape[1] > 2 else errors
+    return float(np.median(between, axis=0).min())
+
+
+def novelty(demonstrated: FloatArray, keypoints: FloatArray) -> float:
+    """How far a scene lies from the demonstrations: its squared Mahalanobis distance, over the largest among them.
+
+    ``demonstrated (I, K, 3)`` and ``keypoints (K, 3)`` in metres. Distances are from the mean of the demonstrations, of
+    a demonstration from the mean of the others; `NOISE_M` is added to each coordinate's variation. Above 1 a scene lies
+    outside; NaN for fewer than `MIN_SCENES`, or where all show one scene.
+    """
+    count = len(demonstrated)
+    if count < MIN_SCENES:
         return float("nan")
     apart = np.sqrt(((demonstrated[:, None] - demonstrated) ** 2).sum(axis=-1).mean(axis=-1))
-    if np.median(apart[np.triu_indices(len(apart), 1)]) < LEAST_SPREAD_M:
+    if np.median(apart[np.triu_indices(count, 1)]) < LEAST_SPREAD_M:
         return float("nan")
-    usual = float(np.median(np.where(np.eye(len(apart), dtype=bool), np.inf, apart).min(axis=1)))
-    distance = float(np.sqrt(((demonstrated - keypoints) ** 2).sum(axis=-1).mean(axis=-1)).min())
-    return distance / max(usual, LEAST_SPREAD_M)
+    rows = demonstrated.reshape(count, -1)
+    others = [np.delete(rows, index, axis=0) for index in range(count)]
+    largest = max(_squared_distance(own, row) for own, row in zip(others, rows, strict=True))
+    return _squared_distance(rows, keypoints.ravel()) / largest
+
+
+def _squared_distance(rows: FloatArray, row: FloatArray) -> float:
+    """Squared Mahalanobis distance of ``row (D,)`` from ``rows (I, D)``, with `NOISE_M` in every coordinate."""
+    x, new = rows - rows.mean(axis=0), row - rows.mean(axis=0)
+    # (X'X/I + n²·1)⁻¹ by the I x I matrix of scalar products, which is the smaller one
+    inner = x @ x.T / len(x) + NOISE_M**2 * np.eye(len(x))
+    return float((new @ new - (x @ new) @ np.linalg.solve(inner, x @ new) / len(x)) / NOISE_M**2)
+
+
+def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
+    """How far distances between keypoints differ from the demonstrations', where these preserve them.
+
+    The upper quartile of the differences from the median, over their variation, and over the demonstrations' own: above
+    1 they differ by more than usual. ``demonstrated (I, K, 3)`` and ``keypoints (K, 3)`` in metres; NaN for fewer than
+    `MIN_SCENES`, or where no distance is preserved.
+    """
+    if len(demonstrated) < MIN_SCENES:
+        return float("nan")
+    pairs = np.triu_indices(len(keypoints), 1)
+    shown, new = (np.linalg.norm((p[..., :, None, :] - p[..., None, :, :]), axis=-1) for p in (demonstrated, keypoints))
+    shown, new = shown[:, *pairs], new[pairs]
+
+    def differences(distances: FloatArray, others: FloatArray) -> FloatArray:
+        middle = np.median(others, axis=0)
+        variation = 1.4826 * np.median(np.abs(others - middle), axis=0)
+        off = np.abs(distances - middle) / np.maximum(variation, DISTANCE_M)
+        return off[variation < RIGID_M]
+
+    own = [differences(row, np.delete(shown, index, axis=0)) for index, row in enumerate(shown)]
+    found = differences(new, shown)
+    if not len(found):
+        return float("nan")
+    usual = np.median([np.quantile(off, 0.75) for off in own if len(off)])
+    return float(np.quantile(found, 0.75) / max(float(usual), 1.0))
 
 
 def recognition(keypoint_confidence: FloatArray) -> float:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from robust_instant_policy.context import Prompt, leave_one_out, write_prompt
+from robust_instant_policy.context.alignment import align
 from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception import KeypointExtractor, Located
 from robust_instant_policy.policies.confidence import recognition
 from robust_instant_policy.policies.policy import Progress, Stage, Stopwatch, no_progress
 from robust_instant_policy.policies.settings import Settings
-from robust_instant_policy.sanity import Finding, SetReport, check_demonstrations
+from robust_instant_policy.sanity import Envelope, Finding, SetReport, Surroundings, View, check_demonstrations
 from robust_instant_policy.trajectory import Trajectory, downsample
 
+HORIZONTAL = np.array([0.0, 0.0, 1.0, 0.0])  # plane through the world's origin
 HARDLY_RECOGNISED = "the scene was hardly recognised; is everything there that was there in the demonstrations?"
 
 
@@ -22,29 +27,35 @@ HARDLY_RECOGNISED = "the scene was hardly recognised; is everything there that w
 class Context:
     """What every method over keypoints starts from, made from ``demonstrations``.
 
-    ``keypoints (I, K, 3)``, metres, world, and ``pixels (I, K, 2)`` (u, v) of the I demonstrations; their downsampled
-    ``trajectories``; the ``prompt`` that serialises both; the ``report`` of what was checked; ``prediction_errors
-    (I, S)`` in metres, see `leave_one_out`; ``notes`` for the user, one line each.
+    ``keypoints (I, K, 3)``, metres, world, and ``pixels (I, K, 2)`` (u, v) of the I demonstrations (no pixels, and no
+    ``extractor``, where the keypoints were given); their downsampled ``trajectories``; the ``prompt`` that serialises
+    both; the ``report`` of what was checked; the ``surroundings`` of the gripper; ``prediction_errors (I, S)`` in
+    metres, see `leave_one_out`; ``notes`` for the user, one line each.
     """
 
     demonstrations: tuple[Demonstration, ...]
-    extractor: KeypointExtractor
+    extractor: KeypointExtractor | None
     keypoints: FloatArray
     pixels: FloatArray
     trajectories: tuple[Trajectory, ...]
     prompt: Prompt
     report: SetReport
+    surroundings: Surroundings
     prediction_errors: FloatArray
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class LocatedScene:
-    """What was recognised in one observation, what its checks found, and what both cost."""
+    """What was recognised in one observation, what its checks found, and what both cost.
+
+    ``view`` is the observation as the checks see it; None where only keypoints are known.
+    """
 
     located: Located
     stage: Stage
     findings: tuple[Finding, ...] = ()
+    view: View | None = None
 
     @property
     def keypoints(self) -> FloatArray:
@@ -70,27 +81,52 @@ def build_context(
     report.raise_if_wrong()
     progress("keypoints", 0, 0)
     extractor = KeypointExtractor(
-        settings.num_keypoints, settings.features, workspace=settings.workspace, seed=settings.seed
-    ).fit(
-        [demonstration.observation for demonstration in demonstrations],
-        [demonstration.trajectory for demonstration in demonstrations],
+        settings.num_keypoints,
+        settings.features,
+        settings.workspace,
+        settings.seed,
+        settings.descriptors,
+        settings.keypoints,
+    ).fit([one.observation for one in demonstrations], [one.trajectory for one in demonstrations])
+    given = context_of_keypoints(extractor.keypoints_, [one.trajectory for one in demonstrations], settings)
+    aligned = align(given.trajectories)
+    views = [View.of(demonstrations[index].observation) for index in aligned.kept]
+    return replace(
+        given,
+        demonstrations=tuple(demonstrations),
+        extractor=extractor,
+        pixels=extractor.pixels_,
+        report=report,
+        surroundings=Surroundings.of(views, aligned.actions),
+        notes=(*extractor.notes_, *report.notes),
     )
-    trajectories = tuple(
-        downsample(demonstration.trajectory, settings.downsampling, settings.num_steps)
-        for demonstration in demonstrations
-    )
-    prompt = write_prompt(extractor.keypoints_, trajectories, settings.frames, settings.layout)
+
+
+def context_of_keypoints(keypoints: FloatArray, trajectories: Sequence[Trajectory], settings: Settings) -> Context:
+    """The context of demonstrations whose ``keypoints (I, K, 3)``, metres, world, are known.
+
+    There are no images to check; a plan is still held against the envelope of ``trajectories``.
+    """
+    thinned = tuple(downsample(one, settings.downsampling, settings.num_steps) for one in trajectories)
+    prompt = write_prompt(keypoints, thinned, settings.frames, settings.layout)
     return Context(
-        tuple(demonstrations),
-        extractor,
-        extractor.keypoints_,
-        extractor.pixels_,
-        trajectories,
+        (),
+        None,
+        keypoints,
+        np.zeros((len(keypoints), 0, 2)),
+        thinned,
         prompt,
-        report,
-        leave_one_out(extractor.keypoints_, trajectories, prompt.frames if settings.frames == "adaptive" else None),
-        (*extractor.notes_, *report.notes),
+        SetReport((), Envelope.of(trajectories, HORIZONTAL), None),
+        Surroundings.of((), align(thinned).actions),
+        leave_one_out(keypoints, thinned, prompt.frames if settings.frames == "adaptive" else None),
+        (),
     )
+
+
+def scene_of_keypoints(keypoints: FloatArray) -> LocatedScene:
+    """A scene whose ``keypoints (K, 3)``, metres, world, are known and certain."""
+    count = len(keypoints)
+    return LocatedScene(Located(keypoints, np.zeros((count, 2)), np.ones(count)), Stage("keypoints", 0.0))
 
 
 def locate(context: Context, observation: Observation, progress: Progress = no_progress) -> LocatedScene:
@@ -98,9 +134,11 @@ def locate(context: Context, observation: Observation, progress: Progress = no_p
 
     Raises `GeometryError` where it contradicts them and `KeypointError` where the scene cannot be recognised.
     """
+    if context.extractor is None:
+        raise UsageError("the keypoints of the demonstrations were given; plan with plan_scene(scene_of_keypoints(…))")
     progress("keypoints", 0, 0)
     watch = Stopwatch()
     with watch.stage("keypoints"):
         findings = context.report.require_observation(observation)
         located = context.extractor.locate(observation)
-    return LocatedScene(located, watch.stages[0], findings)
+    return LocatedScene(located, watch.stages[0], findings, View.of(observation))

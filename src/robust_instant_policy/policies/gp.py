@@ -11,13 +11,15 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from robust_instant_policy.context.alignment import align
+from robust_instant_policy.context.codec import MM
+from robust_instant_policy.context.step_frames import StepFrames
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.aggregation import agree, make_plan
 from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
 from robust_instant_policy.policies.policy import Plan, Stopwatch
 from robust_instant_policy.policies.sampling import Proposal
-from robust_instant_policy.trajectory import Trajectory
+from robust_instant_policy.trajectory import ACTION_DIM, Trajectory
 
 # The kernel's parameters, of which the likelihood chooses the logarithms: how much of the outputs' variance is linear
 # in the keypoints (per square metre), smooth in them, and noise; and over how many metres the smooth part varies.
@@ -77,7 +79,11 @@ def _misfit(parameters: FloatArray, inputs: FloatArray, targets: FloatArray) -> 
 
 
 class KeypointRegression(KeypointPolicy):
-    """The trajectory as a Gaussian process of the scene's keypoints, in the world frame."""
+    """The trajectory as a Gaussian process of the scene's keypoints.
+
+    It predicts how a step's numbers in its frame differ from the demonstrations' median: with ``frames="world"`` the
+    whole motion, with ``"adaptive"`` what the frames do not carry over.
+    """
 
     name = "gp"
     process_: GaussianProcess
@@ -87,18 +93,29 @@ class KeypointRegression(KeypointPolicy):
         super().fit_context(context)
         aligned = align(context.trajectories)
         keypoints = context.keypoints[list(aligned.kept)]
-        self._shape = aligned.actions.shape[1:]
+        num_steps, width = aligned.actions.shape[1:]
+        self._frames = (
+            StepFrames.world(num_steps, width // ACTION_DIM)
+            if self.settings.frames == "world"
+            else context.prompt.frames
+        )
+        pairs = zip(keypoints, aligned.actions, strict=True)
+        numbers = np.stack([self._frames.encode(points, actions) for points, actions in pairs])
+        self._median = np.median(numbers, axis=0)
+        residuals = (numbers - self._median) / MM
         self.process_ = GaussianProcess.fitted(
-            keypoints.reshape(len(keypoints), -1), aligned.actions.reshape(len(keypoints), -1)
+            keypoints.reshape(len(keypoints), -1), residuals.reshape(len(keypoints), -1)
         )
         return self
 
     def plan_scene(self, scene: LocatedScene) -> Plan:
         watch = Stopwatch()
         with watch.stage("gaussian process"):
-            mean, deviation = self.process_.predict(scene.keypoints.reshape(1, -1))
-        proposal = Proposal((Trajectory.from_actions(mean.reshape(self._shape)),), tuple(watch.stages))
+            residual, deviation = self.process_.predict(scene.keypoints.reshape(1, -1))
+            numbers = self._median + MM * residual.reshape(self._median.shape)
+            trajectory = Trajectory.from_actions(self._frames.decode(scene.keypoints, numbers))
+        proposal = Proposal((trajectory,), tuple(watch.stages))
         regression = Stopwatch()
         with regression.stage("regression"):  # of one candidate: a rigid gripper, open or closed
-            rigid = replace(agree(proposal, self.settings), scale=np.full(self._shape, deviation[0]))
+            rigid = replace(agree(proposal, self.settings), scale=np.full(self._median.shape, deviation[0]))
         return make_plan(self.context_, scene, proposal, rigid, regression.stages)

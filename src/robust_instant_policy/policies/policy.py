@@ -165,7 +165,9 @@ _ARRAYS: dict[str, tuple[type, str]] = {  # type, and size of each axis: a lette
 def _array(content: dict, name: str, sizes: dict[str, int]) -> NDArray:
     dtype, axes = _ARRAYS[name]
     shape = tuple(sizes[axis] if axis in sizes else int(axis) for axis in axes)
-    values = as_numbers(name, content[name])
+    values = np.asarray(content[name])
+    if dtype is not np.bool_ or values.dtype != np.bool_:
+        values = as_numbers(name, content[name])
     if not np.isfinite(values).all():
         raise ValueError(f"{name} holds values that are not finite")
     if values.shape != shape and values.size + math.prod(shape) > 0:  # an empty array keeps no shape in JSON

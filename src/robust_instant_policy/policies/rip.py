@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any, Self
 
+from robust_instant_policy.llm import LanguageModel
 from robust_instant_policy.policies.aggregation import aggregate
 from robust_instant_policy.policies.confidence import recognition
 from robust_instant_policy.policies.context import LocatedScene
 from robust_instant_policy.policies.instant import KeypointActionTokens
 from robust_instant_policy.policies.policy import Plan
 from robust_instant_policy.policies.sampling import MIN_CANDIDATES, Samples, count_candidates, propose
+from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.trajectory import Trajectory
 
 ENOUGH_AGREEMENT = 0.3  # with adaptive queries, no more are asked above it (chosen in docs/prompts.md)
@@ -21,8 +24,18 @@ class RobustInstantPolicy(KeypointActionTokens):
     The options are those of `KeypointActionTokens`; see `Settings` for ``dof``, ``estimator`` and ``adaptive``.
     """
 
+    @classmethod
+    def paper(cls, llm: LanguageModel, column: str = "sim", **options: Any) -> Self:
+        """What Oh et al. (2025) did and nothing else, with ``column`` "sim" or "real" of their Table II.
+
+        See `Settings.of`; ``options`` as elsewhere, ``estimator="em-number"`` for the networks' model fitted exactly.
+        """
+        return cls(llm, Settings.of({"sim": "paper", "real": "paper-real"}.get(column, column)), **options)
+
     @property
     def name(self) -> str:  # type: ignore[override]
+        if self.settings.estimator == "mean":
+            return "mean"
         if math.isinf(self.settings.dof):
             return "rip-gauss"
         return "rip-adaptive" if self.settings.adaptive else "rip"

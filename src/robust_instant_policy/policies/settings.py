@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,16 +11,27 @@ from numpy.typing import ArrayLike
 from robust_instant_policy.checks import checked_positive, checked_whole
 from robust_instant_policy.context import Frames, Layout
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError, UsageError
+from robust_instant_policy.perception import CORRESPONDENCES, PAPER_REAL, PAPER_SIMULATION, DescriptorSettings
 from robust_instant_policy.regression import DEFAULT_DOF
 from robust_instant_policy.regression.gripper import ESTIMATORS
 from robust_instant_policy.trajectory import TARGET_STEPS
 
 DOWNSAMPLING = ("masked", "uniform")
+COLUMNS = ("auto", "sim", "real")
 WORDS = {
+    "keypoints": CORRESPONDENCES,
+    "column": COLUMNS,
     "frames": get_args(Frames),
     "layout": get_args(Layout),
     "downsampling": DOWNSAMPLING,
     "estimator": ESTIMATORS,
+}
+# What the configurations differ in. Q, ν, K, downsampling and temperature have the paper's values by default.
+_PAPER: dict[str, Any] = {"features": "dino", "keypoints": "nearest", "frames": "world", "layout": "sequence"}
+CONFIGS: dict[str, dict[str, Any]] = {
+    "adaptive": {},
+    "paper": {**_PAPER, "column": "sim", "estimator": "network-sim"},
+    "paper-real": {**_PAPER, "column": "real", "estimator": "network-real"},
 }
 
 
@@ -28,8 +39,10 @@ WORDS = {
 class Settings:
     """Equal settings give equal plans. Hashable; raises an error that names the setting where one makes no sense.
 
-    Keypoints: ``num_keypoints`` K; ``features`` names the image descriptors; ``workspace ((x, y, z), (x, y, z))`` are
-    the lower and upper corner of what is looked at, metres, world. Trajectories: ``downsampling`` "masked" or "uniform"
+    Keypoints: ``num_keypoints`` K; ``features`` names the image descriptors, ``column`` that of the paper's Table II
+    with their parameters ("auto": by the size of the images); ``keypoints`` is how they are found in an image,
+    "registration" of objects or "nearest" descriptors; ``workspace ((x, y, z), (x, y, z))`` are the lower and upper
+    corner of what is registered, metres, world. Trajectories: ``downsampling`` "masked" or "uniform"
     to ``num_steps`` steps. Prompt: ``frames`` and ``layout``, see `write_prompt`. Samples: ``num_queries`` Q at
     ``temperature``; with ``adaptive``, three at first and up to Q while the candidates agree little. Aggregation:
     ``dof`` ν, infinity for the Gaussian ablation; ``estimator``, see `robust_gripper_trajectory`. ``seed`` is that of
@@ -38,6 +51,8 @@ class Settings:
 
     num_keypoints: int = 10
     features: str = "auto"
+    column: str = "auto"
+    keypoints: str = "registration"
     workspace: tuple[tuple[float, ...], ...] | None = None
     downsampling: str = "masked"
     num_steps: int = TARGET_STEPS
@@ -62,10 +77,30 @@ class Settings:
         if self.workspace is not None:
             object.__setattr__(self, "workspace", _corners(self.workspace))
 
+    @classmethod
+    def of(cls, config: str) -> Settings:
+        """Those of the configuration ``config``, one of `CONFIGS`; raises `UnknownNameError`.
+
+        "adaptive" is the default. "paper" is what Oh et al. (2025) did and nothing else, with the columns "Sim" of
+        their Table II, "paper-real" the same with the columns "Real": DINO keypoints by nearest neighbours, whole
+        trajectories in the world frame in one prompt, and the mean of the networks.
+        """
+        if config not in CONFIGS:
+            raise UnknownNameError("config", config, tuple(CONFIGS))
+        return cls(**CONFIGS[config])
+
     @property
     def of_context(self) -> Settings:
         """These settings with what the context does not depend on at its default: equal ones give equal contexts."""
-        return self._only("num_keypoints", "features", "workspace", "downsampling", "num_steps", "frames", "layout")
+        return self._only(
+            "num_keypoints", "features", "column", "keypoints", "workspace", "downsampling", "num_steps", "frames",
+            "layout",
+        )  # fmt: skip
+
+    @property
+    def descriptors(self) -> DescriptorSettings | None:
+        """Parameters of the descriptors; None where the size of the images decides."""
+        return {"auto": None, "sim": PAPER_SIMULATION, "real": PAPER_REAL}[self.column]
 
     @property
     def of_samples(self) -> Settings:

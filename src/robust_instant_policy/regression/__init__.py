@@ -5,6 +5,7 @@ from robust_instant_policy.regression.em import DEFAULT_DOF, fit_numbers
 from robust_instant_policy.regression.gripper import RobustTrajectory, robust_gripper_trajectory
 from robust_instant_policy.regression.mixture import StudentTMixture
 from robust_instant_policy.regression.network import StudentTNetwork
+from robust_instant_policy.regression.numbers import StudentTNumbers
 from robust_instant_policy.regression.student_t import StudentTRegression
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "RobustTrajectory",
     "StudentTMixture",
     "StudentTNetwork",
+    "StudentTNumbers",
     "StudentTRegression",
     "diagnose",
     "fit_numbers",

@@ -17,6 +17,7 @@ from robust_instant_policy.regression.em import DEFAULT_DOF
 from robust_instant_policy.regression.mixture import StudentTMixture
 from robust_instant_policy.regression.modes import share_at_ties
 from robust_instant_policy.regression.network import StudentTNetwork
+from robust_instant_policy.regression.numbers import StudentTNumbers
 from robust_instant_policy.regression.student_t import StudentTRegression, checked_curvature
 from robust_instant_policy.regression.uncertainty import confidence
 from robust_instant_policy.regression.viterbi import viterbi
@@ -26,8 +27,9 @@ POINT_DIM = 9
 TRANSITION_COST = 0.55  # votes, of all at one step, that a change of state must win: a single step never does
 STATE_SCALE = 1 / 7  # scale of the gripper state: wrong for four steps it is a hallucination, for fewer a late change
 TOLERANCE_M = 0.015  # a gripper this far off still grasps
-NETWORKS = {"network": "fast", "network-sim": "sim", "network-real": "real"}  # estimator to training recipe
-ESTIMATORS = ("em", *NETWORKS, "mixture", "median")
+PAPER_NETWORKS = {"network-sim": "sim", "network-real": "real"}  # estimator to column of the paper's Table II
+PAPER_ESTIMATORS = ("em-number", *PAPER_NETWORKS)  # fitted to every number, the gripper state too, as in the paper
+ESTIMATORS = ("em", *PAPER_ESTIMATORS, "network", "mixture", "median", "mean")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +71,11 @@ def robust_gripper_trajectory(
 ) -> RobustTrajectory:
     """The robust gripper trajectory of ``candidates``, each ``(T_q, 10·A)``: three points (m) and the state, per arm.
 
-    ``estimator`` is "em", "network" (the paper's; "network-sim" and "network-real" train it exactly by the columns of
-    its Table II), "mixture" (one whole way of several) or "median" (of each number at each step, as a
-    reference); ``dof`` = inf is the Gaussian ablation, the mean of the candidates. ``times`` are the candidates' own,
+    ``estimator`` is "em" (`StudentTRegression`); one of `PAPER_ESTIMATORS`: the paper's mean of every number, the
+    gripper state included, by networks trained by a column of its Table II or fitted exactly (`StudentTNumbers`);
+    "network", the paper's networks with a faster training; "mixture" (one whole way of several); or "mean" or "median"
+    of each number at each step, as references. Rotation and state are made rigid and 0 or 1 in every case, which an
+    arm needs. ``dof`` = inf is the Gaussian ablation of any of them. ``times`` are the candidates' own,
     within [0, 1], evenly spread by default; the result has ``num_steps`` steps, by default the median of the
     candidates'. ``triangle`` is the gripper, by default measured from the candidates. ``seed`` is the network's.
     ``tolerance``, metres, is what `RobustTrajectory.confidence` is about. ``curvature (B,)``, metres, is the expected
@@ -96,14 +100,19 @@ def robust_gripper_trajectory(
     is_state = np.arange(data.num_dimensions) % ARM_DIM == POINT_DIM
     points = Candidates(data.values[:, ~is_state], data.times, data.starts)
     fit, residuals = _fit_points(points, dof, estimator, seed, expected, usual)
+    by_number = _fit_numbers(data, dof, estimator, seed)
     clocks = data.split(data.times)
-    weights = np.stack([np.interp(at, clock, weight) for clock, weight in zip(clocks, fit.weights, strict=True)])
+    counted = fit.weights if by_number is None else by_number.weights
+    weights = np.stack([np.interp(at, clock, weight) for clock, weight in zip(clocks, counted, strict=True)])
     share = _share_at_ties(points, at, tolerance)
-    if np.isfinite(dof):
+    if estimator != "mean":
         weights = np.minimum(weights, share)
 
     actions, scale = np.empty((count, data.num_dimensions)), np.empty((count, data.num_dimensions))
-    mean = np.median(points.at(at), axis=0) if estimator == "median" else fit.mean(at)
+    if by_number is not None:
+        mean = by_number.mean(at)[:, ~is_state]
+    else:
+        mean = np.median(points.at(at), axis=0) if estimator == "median" else fit.mean(at)
     scale[:, ~is_state] = fit.scale(at)
     scaled = np.zeros_like(data.values)
     scaled[:, ~is_state] = residuals
@@ -114,9 +123,12 @@ def robust_gripper_trajectory(
         actions[:, place] = known.triplets(known.poses(triplets)).reshape(count, POINT_DIM)
         closed = data.values[:, column] > 0.5
         votes = np.stack([_nearest_in_time(at, c, own) for c, own in zip(clocks, data.split(closed), strict=True)])
-        # the cost keeps out a change for a single step, even a unanimous one
-        cost = TRANSITION_COST * float(weights.sum(axis=0).mean())
-        state = viterbi(np.where(votes, weights, -weights).sum(axis=0), cost)
+        if by_number is not None:
+            state = by_number.mean(at)[:, column] > 0.5
+        else:
+            # the cost keeps out a change for a single step, even a unanimous one
+            cost = TRANSITION_COST * float(weights.sum(axis=0).mean())
+            state = viterbi(np.where(votes, weights, -weights).sum(axis=0), cost)
         actions[:, column] = state
         scale[:, column] = (weights * (votes != state)).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-12)
         scaled[:, column] = (closed != _nearest_in_time(data.times, at, state)) / STATE_SCALE
@@ -151,11 +163,21 @@ def _fit_points(
         by_mode = np.stack([scaled_residuals(mode, points, variation) for mode in mixture.modes])
         return mixture, by_mode[own, np.arange(len(own))]
     fit: StudentTRegression | StudentTNetwork
-    if estimator in NETWORKS:
-        fit = StudentTNetwork(dof, NETWORKS[estimator], seed).fit(rows, clocks)
-    else:
+    if estimator == "network":
+        fit = StudentTNetwork(dof, seed=seed).fit(rows, clocks)
+    else:  # of estimators that follow each number by itself, for scale, diagnosis and confidence
         fit = StudentTRegression(dof, groups=one_group, curvature=curvature).fit(rows, clocks)
     return fit, scaled_residuals(fit, points, variation)
+
+
+def _fit_numbers(data: Candidates, dof: float, estimator: str, seed: int) -> StudentTNumbers | StudentTNetwork | None:
+    """The regression of every number whose mean is followed; None for estimators that fit points."""
+    rows, clocks = data.split(data.values), data.split(data.times)
+    if estimator in PAPER_NETWORKS:
+        return StudentTNetwork(dof, PAPER_NETWORKS[estimator], seed).fit(rows, clocks)
+    if estimator in ("em-number", "mean"):
+        return StudentTNumbers(np.inf if estimator == "mean" else dof).fit(rows, clocks)
+    return None
 
 
 def _share_at_ties(points: Candidates, at: FloatArray, tolerance: float) -> FloatArray:

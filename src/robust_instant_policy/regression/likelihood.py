@@ -33,7 +33,6 @@ from robust_instant_policy.regression.em import (
 PRIOR_SAMPLES = 2.0  # candidates' worth of trust in the scale of all steps, against that of one step alone
 PAIRWISE_LIMIT = 4_000_000  # numbers compared pair by pair to find a start; beyond it there are enough for a median
 CORNER_DOF = 2.0  # ν_G: most second differences are small, a few are corners, which are not smoothed
-NEARLY_GAUSSIAN_DOF = 30.0  # from here on smoothing fades, so that ν → ∞ is the mean of the candidates
 FAINT_PRICE = 1e-6  # on second differences, which ties down knots between which no candidate has a sample
 STRAIGHT = 1e10  # times the precision of the data: at higher prices the curve is straight to every digit
 
@@ -98,17 +97,17 @@ def pose_problem(
     floor = groups @ squared_scale_floor(median)
     squared = groups @ (1.5 * deviation.mean(axis=0)) ** 2 + floor
     curve = median
-    if np.isfinite(dof) and blocks.size * len(blocks) < PAIRWISE_LIMIT and len(blocks) > 1:
+    if blocks.size * len(blocks) < PAIRWISE_LIMIT and len(blocks) > 1:
         gaps = ((blocks[:, None] - blocks[None]) ** 2 @ (1 / squared)) / len(squared)
         # the diagonal is taken out: a candidate does not support itself
-        support = expected_precision(gaps / 2, dof).sum(axis=1) - (dof + 1) / dof
+        support = expected_precision(gaps / 2, dof).sum(axis=1) - expected_precision(np.zeros(1), dof)
         curve = np.einsum("qk,qkd->kd", support / support.sum(axis=0), blocks)
 
     precision = np.zeros(differences.count)
     if curvature is not None and differences.count:
         knots, known = basis.knots, np.linspace(0, 1, len(curvature))
         expected = np.interp(knots[1:-1], known, curvature) * (np.diff(knots).mean() * (len(curvature) - 1)) ** 2
-        precision = expected**-2.0 * smoothing_share(dof)
+        precision = expected**-2.0
     trust = np.ones(len(data.values))
     problem = Problem(data, basis, differences, dof, unit, groups, floor, precision, trust)
     return problem, evaluate(problem, curve, squared, np.ones(len(basis.knots)))
@@ -117,11 +116,6 @@ def pose_problem(
 def squared_scale_floor(curve: FloatArray) -> FloatArray:
     """The least squared scale ``(D,)`` about a ``curve (K, D)``: a thousandth of its motion, and rounding errors."""
     return (SCALE_FLOOR * np.ptp(curve, axis=0) + ROUNDING * np.abs(curve).max(axis=0) + 1e-100) ** 2
-
-
-def smoothing_share(dof: float) -> float:
-    """How much of all smoothing is wanted: 1, but ever less where ν → ∞ is to be the mean of the candidates."""
-    return min(1.0, NEARLY_GAUSSIAN_DOF / dof) ** 2
 
 
 def mean_over_scale(squares: FloatArray, squared_scale: FloatArray) -> FloatArray:

@@ -13,7 +13,6 @@ from robust_instant_policy.regression.likelihood import (
     mean_over_scale,
     normal_equations,
     prices,
-    smoothing_share,
 )
 
 STIFFNESSES = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0])  # λ that are tried, in 1/σ²
@@ -40,7 +39,7 @@ def choose_stiffness(problem: Problem, fit: Fit) -> Problem:
     penalty = problem.differences.penalty_matrix
     target = multiply_banded(normal + penalty(prices(problem, fit.squared_scale, fit.curvature, normal)), fit.curve)
     curve, curvature, least, choice = fit.curve, fit.curvature, np.inf, fixed
-    for stiffness in (0.0, *STIFFNESSES * smoothing_share(problem.dof)):
+    for stiffness in (0.0, *STIFFNESSES):
         tried = replace(fixed, stiffness=float(stiffness))
         for _ in range(CORNER_SWEEPS):
             bands = normal + penalty(prices(tried, fit.squared_scale, curvature, normal))

@@ -38,17 +38,16 @@ class Solution:
 def solve(data: Candidates, dof: float, unit: str, groups: FloatArray, curvature: FloatArray | None) -> Solution:
     """The robust pipeline: EM → reject stretches → EM → choose the stiffness → EM to convergence.
 
-    For ``dof`` = inf nothing is rejected or smoothed, and the curve is the mean of the candidates.
+    It is the same for every ``dof``. At inf all weights are 1, so no stretch is rejected; smoothing and prior stay.
     """
     problem, fit = pose_problem(data, dof, unit, groups, curvature)
-    if np.isfinite(dof):
-        for _ in range(DRAFT_ITERATIONS):
+    for _ in range(DRAFT_ITERATIONS):
+        fit = improve(problem, fit)
+    if unit != "trajectory":
+        problem, fit = reject_stretches(problem, fit)
+        for _ in range(REDRAFT_ITERATIONS):
             fit = improve(problem, fit)
-        if unit != "trajectory":
-            problem, fit = reject_stretches(problem, fit)
-            for _ in range(REDRAFT_ITERATIONS):
-                fit = improve(problem, fit)
-        problem = choose_stiffness(problem, fit)
+    problem = choose_stiffness(problem, fit)
     return Solution(problem, *maximise(problem, fit))
 
 
@@ -58,7 +57,7 @@ class StudentTRegression:
     >>> fit = StudentTRegression(dof=1.5).fit([a_1, ..., a_Q])      # each (T_q, D)
     >>> fit.mean(times), fit.scale(times), fit.weights              # (T, D), (T, D), list of (T_q,)
 
-    ``dof`` is the paper's ν; ``inf`` is the Gaussian ablation, whose mean is the mean of the candidates.
+    ``dof`` is the paper's ν; ``inf`` is the Gaussian ablation: the same estimator, with a weight of 1 for everyone.
     ``unit`` is what is right or wrong together: the numbers of a "step" (whose outlying stretches are then rejected
     whole), those of a whole "trajectory", or every "number" by itself, as in the paper's Eq. 1, with ``groups`` unused.
     ``groups (D,)`` are labels of the dimensions that share one scale, such as the coordinates of points, which makes
@@ -107,8 +106,7 @@ class StudentTRegression:
         traces = [np.pad(one.trace, (0, self.num_iterations - len(one.trace)), "edge") for one in solutions]
         self.log_likelihood = np.sum(traces, axis=0)
         weights = np.mean([np.minimum(one.fit.weights, 1.0) for one in solutions], axis=0)
-        if np.isfinite(self.dof):
-            weights = np.minimum(weights, np.interp(data.times, self.knots, share_at_ties(data, groups, self.knots)))
+        weights = np.minimum(weights, np.interp(data.times, self.knots, share_at_ties(data, groups, self.knots)))
         self.weights = data.split(weights)
         return self
 

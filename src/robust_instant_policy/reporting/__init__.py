@@ -1,1 +1,1 @@
-"""Pages, tables and figures: views on what runs, datasets and evaluations wrote."""
+"""Pages, tables and figures about runs, datasets and evaluations."""

@@ -1,4 +1,4 @@
-"""A self-contained page on `sanity.check_demonstrations`: what is wrong, and what each image shows."""
+"""A self-contained page with the findings of `sanity.check_demonstrations` and the start images."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _contacts(report: SetReport) -> Table | None:
         )
     head = (
         "demonstration", "gap of the path [mm]", "gaps where the gripper closes [mm]", "lowest fingertip [mm]",
-        "palm behind a surface [mm]", "like the others",
+        "gripper point behind a surface [mm]", "like the others",
     )  # fmt: skip
     return Table(head, tuple(rows), "Gaps are 0 where the path passes through what the image shows.")
 

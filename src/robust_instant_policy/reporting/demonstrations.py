@@ -39,7 +39,7 @@ class StripArm:
 
 @dataclass(frozen=True)
 class EpisodeCard:
-    """What the page says of one episode; ``video`` is empty where no images were recorded."""
+    """An episode on the page; ``video`` is empty if no images were recorded."""
 
     facts: tuple[str, ...]
     image: Picture
@@ -107,7 +107,7 @@ def _facts(demonstrations: Sequence[Demonstration], discarded: int, with_images:
 
 
 def _paths(demo: Demonstration) -> dict[str, object]:
-    """What the page draws in 3-D: for each arm its path, its gripper along it, and where that was closed."""
+    """Data of the 3-D drawing: for each arm its path, the gripper along it, and the gripper state."""
     steps = _drawn_steps(len(demo.trajectory))
     triplets = demo.trajectory.triplets[steps]
     closed = demo.trajectory.gripper_state[steps] > 0.5

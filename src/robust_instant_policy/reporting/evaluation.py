@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import Failure, video_file
+from robust_instant_policy.evaluation.variant import PAPER_CONFIGS
 from robust_instant_policy.files import read_regular
 from robust_instant_policy.reporting.pages import data_uri, render
 from robust_instant_policy.reporting.tables import Table
+from robust_instant_policy.tasks.level import PAPER
 
 TITLES = {
     "chosen": "Success rates",
@@ -24,40 +27,47 @@ TITLES = {
 WHISKERS = "Whiskers: Wilson's 95% interval; of the average, ± one standard deviation over tasks."
 CAPTIONS = {
     "chosen": f"Success in each task. {WHISKERS}",
-    "table1": f"Success in each task. {WHISKERS} Black lines: the paper's own numbers, with other scenes and GPT-4o.",
+    "table1": f"Success in each task. {WHISKERS}",
     "demos": "Mean over tasks and, shaded, ± one standard deviation, by the number of demonstrations.",
     "queries": "RIP by the number Q of trajectories that the language model is asked for; symbols are single tasks.",
     "dof": "RIP by the degrees of freedom ν; ∞ is the Gaussian average. Symbols are single tasks.",
     "downsampling": "RIP on tasks with gripper actions. Whiskers: Wilson's 95% interval.",
     "trajectories": "Position over time in the scene in which RIP and the Gaussian average differ most.",
 }
+TOLD = " Black lines: the paper's own numbers, with other scenes and GPT-4o; for ALOHA's tasks, of a physical robot."
 CAUSES = {
-    "execution": "execution: even the demonstrator's own trajectory fails when it is replayed",
+    "execution": "execution: the demonstrator's own trajectory fails, too, when it is replayed",
     "keypoints": "keypoints: with the true keypoints the method succeeds",
-    "samples": "samples: no candidate succeeds, or a single sample was executed as it was",
-    "regression": "regression: one of its candidates succeeds by itself",
+    "samples": "samples: no candidate succeeds, or a single sample was executed",
+    "regression": "regression: one of its candidates succeeds alone",
     "policy": "policy: the demonstrator's trajectory succeeds when it is replayed",
 }
 
 
 @dataclass(frozen=True)
 class Section:
-    """One suite: its name, the ``kinds`` of its objects where they are not the usual ones, its figure as SVG and its
-    tables.
+    """One suite in one configuration: its name and level, the ``config``, the ``kinds`` of its objects where they are
+    not the level's usual ones, its figure as SVG and its tables.
     """
 
     name: str
+    level: str
+    config: str
     kinds: tuple[str, ...]
     figure: bytes
     tables: Sequence[Table]
 
     @property
     def title(self) -> str:
-        return TITLES[self.name] + (f" ({', '.join(self.kinds)} objects)" if self.kinds else "")
+        config = f", configuration: {self.config}" if self.config else ""
+        level = "" if self.level == PAPER.name else f", {self.level} scenes"
+        return TITLES[self.name] + config + level + (f" ({', '.join(self.kinds)} objects)" if self.kinds else "")
 
     @property
     def anchor(self) -> str:
-        return "-".join((self.name, *self.kinds))
+        config = re.sub(r"[^\w.-]+", "-", self.config)
+        level = "" if self.level == PAPER.name else self.level
+        return "-".join(word for word in (self.name, config, level, *self.kinds) if word)
 
     @property
     def image(self) -> str:
@@ -65,12 +75,12 @@ class Section:
 
     @property
     def caption(self) -> str:
-        return CAPTIONS[self.name]
+        return CAPTIONS[self.name] + (TOLD if self.name == "table1" and self.config in PAPER_CONFIGS else "")
 
 
 @dataclass(frozen=True)
 class FailedEpisode:
-    """What the page says of one; ``video`` is a data URL, or empty where there is none."""
+    """A failed episode on the page; ``video`` is a data URL, empty if there is no video."""
 
     outcome: str
     cause: str
@@ -94,8 +104,9 @@ def evaluation_page(
     causes = {failure.key: failure for failure in failures}
     groups: dict[str, list[FailedEpisode]] = {}
     failed = [row for row in episodes if not row.success]
-    for row in sorted(failed, key=lambda row: (row.scene.task, row.variant.method)):
-        group = groups.setdefault(f"{row.scene.task}, {row.variant.method}", [])
+    for row in sorted(failed, key=lambda row: (row.scene.task, row.variant.method, row.variant.config)):
+        words = (row.scene.task, row.variant.method, row.variant.config)
+        group = groups.setdefault(", ".join(word for word in words if word), [])
         group.append(_failed_episode(folder, row, causes.get(row.key)))
     tasks = ", ".join(dict.fromkeys(row.scene.task for row in episodes))
     return render(

@@ -55,6 +55,7 @@ STYLES = {
     "rip": Style("#4a78ad", "", "o", "-"),
     "rip-gauss": Style("#a9c8e8", "//", "s", "--"),
     "rip-adaptive": Style("#3f9188", "xx", "D", (0, (5, 1))),
+    "mean": Style("#7d7d7d", "..", "h", (0, (2, 1))),
     "kat": Style("#d98032", "\\\\", "^", "-."),
     "kat-dp": Style("#f0c58f", "||", "v", ":"),
     "dp": Style("#c9c9c9", "--", "P", (0, (1, 1))),
@@ -92,7 +93,7 @@ def _success_bars(summary: Summary) -> Figure:
         axes = figure.add_subplot(num_rows, 1, row + 1)
         _bars(axes, summary, groups[bounds[row] : bounds[row + 1]], styles, partial(_paper_percent, summary))
         if row == 0:
-            told = any(variant.method in paper.TABLE1 for variant in summary.variants)
+            told = paper.is_told(summary.variants)
             _legend_above(axes, styles, labels(summary.variants), "paper, with GPT-4o" if told else "", 4)
     return figure
 
@@ -134,9 +135,9 @@ def _bars(axes: Axes, summary: Summary, groups: Sequence[str], styles: Sequence[
 def _paper_percent(summary: Summary, variant: Variant, group: str) -> float | None:
     """The paper's number for a task, or its average over the tasks that ``variant`` was tried in here."""
     if group != AVERAGE:
-        return paper.table1(variant.method, group)
+        return paper.told(variant, group, summary.variants)
     tried = [task for task in summary.tasks if summary.rate(variant, task) is not None]
-    known = [told for task in tried if (told := paper.table1(variant.method, task)) is not None]
+    known = [told for task in tried if (told := paper.told(variant, task, summary.variants)) is not None]
     return fmean(known) if len(known) == len(tried) else None
 
 
@@ -212,34 +213,37 @@ def _downsampling(summary: Summary) -> Figure:
     groups = [*summary.tasks, AVERAGE]
     styles = [looks[way] for way in ways]
 
+    is_told = paper.is_told(summary.variants)
+
     def told(variant: Variant, group: str) -> float | None:
-        return paper.DOWNSAMPLING[variant.downsampling] if group == AVERAGE else None
+        return paper.DOWNSAMPLING[variant.downsampling] if is_told and group == AVERAGE else None
 
     _bars(axes, summary, groups, styles, told)
-    _legend_above(axes, styles, [names[way] for way in ways], "paper, average of 5 tasks", 2)
+    _legend_above(axes, styles, [names[way] for way in ways], "paper, average of 5 tasks" if is_told else "", 2)
     return figure
 
 
 def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan]) -> Figure:
-    """Gripper point over time where RIP and the Gaussian average differ most (Oh et al. 2025, Fig. 5a)."""
+    """Gripper point over time where RIP and the ablation differ most (Oh et al. 2025, Fig. 5a)."""
     figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
     by_scene: dict[Scene, dict[str, Plan]] = {}
     for (scene, variant), plan in plans.items():
         by_scene.setdefault(scene, {})[variant.method] = plan
-    whole = {scene: of for scene, of in by_scene.items() if {"rip", "rip-gauss"} <= of.keys()}
+    other = "rip-gauss" if any("rip-gauss" in of for of in by_scene.values()) else "mean"
+    whole = {scene: of for scene, of in by_scene.items() if {"rip", other} <= of.keys()}
     if not whole:
         figure.text(0.5, 0.5, "no scene has been planned by both rip and rip-gauss yet", ha="center")
         return figure
     panels = figure.subplots(1, 3, sharex=True)
-    scene = max(whole, key=lambda one: _difference(whole[one]["rip"], whole[one]["rip-gauss"]))
-    robust, gauss = whole[scene]["rip"], whole[scene]["rip-gauss"]
+    scene = max(whole, key=lambda one: _difference(whole[one]["rip"], whole[one][other]))
+    robust, ablation = whole[scene]["rip"], whole[scene][other]
     for axis, panel in enumerate(panels):
         for candidate, hallucinated in zip(robust.candidates, robust.hallucinated, strict=True):
             label = "KAT, hallucinated" if hallucinated else "KAT"
             style = {"linestyle": ":", "linewidth": 1.6} if hallucinated else {"linestyle": "-", "linewidth": 0.8}
             panel.plot(candidate.times, MM * candidate.actions[:, axis], color="#9a9a9a", label=label, **style)
         for plan, method, colour, label in (
-            (gauss, "rip-gauss", "black", "RIP Gaussian"),
+            (ablation, other, "black", {"rip-gauss": "RIP Gaussian"}.get(other, other)),
             (robust, "rip", None, "RIP"),
         ):
             look = STYLES[method]
@@ -248,7 +252,7 @@ def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan])
                 color=colour or look.colour, marker=look.marker, markersize=3, markevery=4, label=label,
             )  # fmt: skip
         panel.set_xlabel("time, share of the episode")
-        panel.set_ylabel(f"palm {'xyz'[axis]} [mm]")
+        panel.set_ylabel(f"gripper {'xyz'[axis]} [mm]")
     handles, labels = panels[0].get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=len(unique))
@@ -256,10 +260,10 @@ def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan])
     return figure
 
 
-def _difference(robust: Plan, gauss: Plan) -> tuple[bool, float]:
-    """Whether a candidate is hallucinated, and the largest distance between RIP and the Gaussian average, in metres."""
+def _difference(robust: Plan, ablation: Plan) -> tuple[bool, float]:
+    """Whether a candidate is hallucinated, and the largest distance between RIP and the ablation, in metres."""
     times = np.linspace(0.0, 1.0, 50)
-    points = [plan.trajectory.resampled(times).actions[:, :3] for plan in (robust, gauss)]
+    points = [plan.trajectory.resampled(times).actions[:, :3] for plan in (robust, ablation)]
     return bool(robust.hallucinated.any()), float(np.linalg.norm(points[0] - points[1], axis=1).max())
 
 

@@ -16,6 +16,7 @@ from robust_instant_policy.policies import Plan
 from robust_instant_policy.reporting.evaluation import Section, evaluation_page
 from robust_instant_policy.reporting.figures import draw, encode
 from robust_instant_policy.reporting.tables import Table, failure_table, invocation_table, tables
+from robust_instant_policy.tasks.level import make_level
 
 TABLE_FILE = "table.md"
 FAILURE_TABLE_FILE = "failures.md"
@@ -24,9 +25,10 @@ PAGE_FILE = "index.html"
 
 
 def publish(out: Path) -> str:
-    """Write, for each suite in ``out``, ``SUITE.svg``, ``SUITE.png`` and ``SUITE.md``; then ``failures.md``,
-    ``run.md``, ``table.md`` with all tables, and ``index.html``. Returns the text of ``table.md``. Methods and tasks
-    chosen by hand have a section of their own only as far as no analysis of the paper shows their rows.
+    """Write, for each suite in ``out`` and each configuration in it, ``SUITE-CONFIG.svg``, ``.png`` and ``.md``;
+    then ``failures.md``, ``run.md``, ``table.md`` with all tables, and ``index.html``. Returns the text of
+    ``table.md``. Methods and tasks chosen by hand have a section of their own only as far as no analysis of the
+    paper shows their rows.
 
     Raises `DatasetError` where nothing has been executed yet.
     """
@@ -34,15 +36,18 @@ def publish(out: Path) -> str:
     episodes, failures, manifest = results.episodes, results.failures, results.manifest
     if not episodes:
         raise DatasetError(f"{out} holds no executions yet; run rip eval --out {out} first")
-    summaries = [Summary(suite, episodes) for suite in manifest.suites]
-    of_paper = {row.key for summary in summaries if summary.suite.name != CHOSEN for row in summary.rows}
-    shown = [
-        summary
-        for summary in summaries
-        if summary.rows and (summary.suite.name != CHOSEN or not {row.key for row in summary.rows} <= of_paper)
+    summaries = [
+        (config, Summary(part, episodes)) for suite in manifest.suites for config, part in suite.by_config().items()
     ]
-    sections = [_publish_suite(out, summary) for summary in shown]
-    rows = list({row.key: row for summary in shown for row in summary.rows}.values())
+    of_paper = {row.key for _, summary in summaries if summary.suite.name != CHOSEN for row in summary.rows}
+    shown = [
+        (config, summary)
+        for config, summary in summaries
+        if any(row.variant.config == config for row in summary.rows)
+        and (summary.suite.name != CHOSEN or not {row.key for row in summary.rows} <= of_paper)
+    ]
+    sections = [_publish_suite(out, config, summary) for config, summary in shown]
+    rows = list({row.key: row for _, summary in shown for row in summary.rows}.values())
     lost = failure_table(rows, failures)
     text = _text([table for section in sections for table in section.tables])
     write_whole(out / FAILURE_TABLE_FILE, lost.markdown().encode())
@@ -55,12 +60,13 @@ def publish(out: Path) -> str:
     return text
 
 
-def _publish_suite(out: Path, summary: Summary) -> Section:
+def _publish_suite(out: Path, config: str, summary: Summary) -> Section:
     suite = summary.suite
-    kinds = tuple(kind for kind, usual in ((suite.objects, "seen"), (suite.assets, "code")) if kind != usual)
+    usual = make_level(suite.level).objects
+    kinds = tuple(kind for kind, expected in ((suite.objects, usual), (suite.assets, "code")) if kind != expected)
     figure = draw(summary, _kept_plans(out, summary))
     drawing = encode(figure, "svg")
-    section = Section(suite.name, kinds, drawing, tables(summary))
+    section = Section(suite.name, suite.level, config, kinds, drawing, tables(summary))
     stem = section.anchor
     write_whole(out / f"{stem}.svg", drawing)
     write_whole(out / f"{stem}.png", encode(figure, "png"))

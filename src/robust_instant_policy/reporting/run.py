@@ -1,4 +1,4 @@
-"""The self-contained page about one run: what was seen, proposed, kept and executed."""
+"""The self-contained page about one run: image, candidates, robust trajectory and execution."""
 
 from __future__ import annotations
 
@@ -55,10 +55,7 @@ RUN_FILE, PLAN_FILE, SEEN_FILE, CONTEXT_FILE, VIDEO_FILE, REPORT_FILE = (
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What is known of a run beside the plan.
-
-    ``success`` is None where the plan was not executed.
-    """
+    """The facts of a run that are not in the plan. ``success`` is None if the plan was not executed."""
 
     task: str
     description: str
@@ -74,7 +71,7 @@ class RunRecord:
 
     @classmethod
     def load(cls, folder: Path) -> RunRecord:
-        """Raises `DatasetError` where ``folder`` holds no run, or a damaged one."""
+        """Raises `DatasetError` if ``folder`` holds no run, or a damaged one."""
         try:
             content = json.loads(read_regular(folder / RUN_FILE))
             record = cls(**{**content, "stages": tuple(Stage(**stage) for stage in content["stages"])})
@@ -87,7 +84,7 @@ class RunRecord:
 
 
 def save_context(folder: Path, images: Sequence[NDArray[np.uint8]], pixels: FloatArray) -> None:
-    """Keep the demonstrations' start images and their keypoints' ``pixels (I, K, 2)`` beside the plan."""
+    """Store the demonstrations' start images and their keypoints' ``pixels (I, K, 2)`` beside the plan."""
     arrays = {f"rgb_{index}": image for index, image in enumerate(images)}
     np.savez_compressed(folder / CONTEXT_FILE, pixels=pixels, **arrays)  # type: ignore[arg-type]
 
@@ -195,8 +192,12 @@ def _candidate_table(plan: Plan) -> Table:
 EVIDENCE: dict[str, tuple[str, Callable[[float], str]]] = {
     "agreement": ("agreement of the candidates", lambda value: f"{value:.2f}"),
     "prediction": ("error with which demonstrations predict each other", lambda value: f"{MM * value:.0f} mm"),
-    "novelty": ("distance of the scene from the nearest demonstration, 1 is usual", lambda value: f"{value:.1f}"),
-    "warnings": ("warnings of the checks", lambda value: f"{value:.0f}"),
+    "distortion": ("change of distances between keypoints, about 1 is usual", lambda value: f"{value:.1f}"),
+    "novelty": ("distance of the scene from the demonstrations, above 1 it lies outside", lambda value: f"{value:.1f}"),
+    "displacement": ("displacement against what is around the gripper", lambda value: f"{MM * value:.0f} mm"),
+    "precision": ("displacement of demonstrations against each other", lambda value: f"{MM * value:.0f} mm"),
+    "doubts": ("doubts whether states, grasps and rotations were recorded rightly", lambda value: f"{value:.0f}"),
+    "warnings": ("other warnings of the checks", lambda value: f"{value:.0f}"),
     "errors": ("errors of the checks", lambda value: f"{value:.0f}"),
 }  # see `policies.confidence.Evidence`
 

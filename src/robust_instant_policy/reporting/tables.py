@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from statistics import fmean
 
 from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.episodes import Episode
@@ -16,14 +15,13 @@ from robust_instant_policy.evaluation.statistics import (
     Summary,
     mark,
     mean_and_deviation,
-    paired_test,
     reference,
-    t_test,
 )
-from robust_instant_policy.evaluation.variant import Variant, by_demos, dof_symbol, labels, values
+from robust_instant_policy.evaluation.variant import Variant, by_demos, configs, dof_symbol, labels, values
 from robust_instant_policy.policies import METHOD_NAMES
 
 NONE = "–"
+INTERVAL = "Wilson's 95% interval with one trial a scene"
 
 
 @dataclass(frozen=True)
@@ -45,38 +43,47 @@ def tables(summary: Summary) -> list[Table]:
 
 
 def success_table(summary: Summary) -> Table:
-    """Table I: one row a method, for each task the success rate in percent and the paper's own beside it."""
-    ours = reference(summary.variants)
-    told = [task for task in summary.tasks if task in paper.TABLE1_TASKS]
+    """Table I: one row a method, for each task the success rate in percent, and the paper's own beside rows of its
+    configuration.
+    """
+    ours, variants = reference(summary.variants), summary.variants
+    told = [task for task in summary.tasks if task in paper.TABLE1_TASKS] if paper.is_told(variants) else []
+    stars = {one.variant: one.mark for one in summary.compare(ours)} if ours is not None else {}
+    sets = {variant: summary.of_sets(variant) for variant in summary.variants}
+    several = any(len(rates) > 1 for rates in sets.values())
     head = ["method"]
     for task in summary.tasks:
-        head += [task, "paper"] if task in told else [task]
+        of_paper = "paper, physical robot" if task.startswith("aloha") else "paper"
+        head += [task, of_paper] if task in told else [task]
     rows = []
     for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
         row = [label]
         for task in summary.tasks:
             row.append(_cell(summary.rate(variant, task), summary.best(task)))
             if task in told:
-                percent = paper.table1(variant.method, task)
+                percent = paper.told(variant, task, variants)
                 row.append(NONE if percent is None else str(percent))
-        stars = ""
-        if ours is not None and variant != ours:
-            own, others = _both(summary, ours, variant)
-            stars = mark(t_test(own, others)) if own and fmean(own) > fmean(others) else ""
         tried = [task for task in told if summary.rate(variant, task) is not None]
-        row += [_spread(summary, variant, stars), _paper_average(variant, tried)]
+        row.append(_spread(summary, variant, stars.get(variant, "")))
+        if several:
+            row.append(", ".join(f"{100 * rate:.1f}" for rate in sets[variant].values()))
+        if told:
+            row.append(_paper_average(variant, tried, variants))
         rows.append(tuple(row))
     counts = ", ".join(
         f"{label} {_executions(summary, variant)}"
         for variant, label in zip(summary.variants, labels(summary.variants), strict=True)
     )
+    over_same = ", the paper's over the same" if told else ""
+    by_set = "The averages with each set of demonstrations stand beside them. " if several else ""
     return Table(
-        (*head, "average", "paper"),
+        (*head, "average", *(["with each set"] if several else []), *(["paper"] if told else [])),
         tuple(rows),
-        "Success in percent; in parentheses Wilson's 95% interval; the best of a task is bold. Averages are mean ± "
-        "standard deviation over the tasks that the method was tried in, the paper's over the same; RIP is "
-        "significantly better than those marked \\* or \\*\\* (t-test as in the paper, p < 0.05 and p < 0.005). "
-        f"Executions a task: {counts}.",
+        f"{_configuration(variants)}Success in percent; in parentheses {INTERVAL}; the best of a task is bold. "
+        "Averages are mean ± standard deviation over the tasks that the method was tried in"
+        f"{over_same}. {by_set}RIP is "
+        "significantly better than those marked \\* or \\*\\* (sign-flip test over scenes, Holm's correction for the "
+        f"methods in this table, p < 0.05 and p < 0.005). Executions a task: {counts}.",
     )
 
 
@@ -85,28 +92,37 @@ def test_table(summary: Summary) -> Table | None:
     ours = reference(summary.variants)
     if ours is None or len(summary.variants) == 1:
         return None
+    told = dict(zip(summary.variants, labels(summary.variants), strict=True))
     rows = []
-    for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
-        if variant == ours:
-            continue
-        paired = paired_test(summary.of_scenes(ours), summary.of_scenes(variant))
-        own, theirs = _both(summary, ours, variant)
+    for one in summary.compare(ours):
+        low, high = one.interval
         rows.append(
             (
-                label,
-                f"{100 * (fmean(own) - fmean(theirs)):+.1f}" if own else NONE,
-                _p(t_test(own, theirs)),
-                str(paired.scenes),
-                str(paired.better),
-                str(paired.worse),
-                _p(paired.p) if paired.scenes else NONE,
+                told[one.variant],
+                f"{100 * one.difference:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})" if one.paired.scenes else NONE,
+                str(one.paired.scenes),
+                str(one.paired.better),
+                str(one.paired.worse),
+                _p(one.paired.p) if one.paired.scenes else NONE,
+                _p(one.corrected),
+                _p(one.t_test),
             )
         )
-    head = ("rip against", "difference", "t-test p", "shared scenes", "rip better in", "worse in", "paired p")
+    head = (
+        "rip against",
+        "difference",
+        "shared scenes",
+        "rip better in",
+        "worse in",
+        "paired p",
+        "Holm's p",
+        "t-test p",
+    )
     note = (
-        "Difference in percentage points of the averages over the tasks that both methods were tried in. The t-test is "
-        "the paper's, over these tasks; the paired test is exact, over the scenes that both methods were tried in "
-        "(McNemar's where each has one execution)."
+        "Difference in percentage points of the averages over the tasks that both methods were tried in, with the same "
+        "scenes and sets of demonstrations; in parentheses its 95% interval (cluster bootstrap over scenes). The "
+        "paired test is the exact sign-flip test over shared scenes (McNemar's where each has one execution); Holm's p "
+        "corrects it for the number of methods. The t-test is the paper's, over tasks, without correction."
     )
     return Table(head, tuple(rows), note)
 
@@ -123,8 +139,9 @@ def sweep_table(summary: Summary, name: str, value: Callable[[Variant], str]) ->
     return Table(
         head,
         tuple(rows),
+        f"{_configuration(summary.variants)}"
         f"Success of {summary.variants[0].method} in percent, {summary.variants[0].demos} demonstrations shown; in "
-        "parentheses Wilson's 95% interval; the best of a task is bold. Averages: mean ± standard deviation over "
+        f"parentheses {INTERVAL}; the best of a task is bold. Averages: mean ± standard deviation over "
         f"tasks. Executions a task: {', '.join(counts)}.",
     )
 
@@ -142,14 +159,15 @@ def demos_table(summary: Summary) -> Table:
                 continue
             low, high = pooled.interval
             cells.append(
-                f"{_spread(summary, of_count[count])} ({100 * low:.0f} to {100 * high:.0f}, n={pooled.trials})"
+                f"{_spread(summary, of_count[count])} ({100 * low:.0f} to {100 * high:.0f}, n={pooled.scenes})"
             )
         rows.append((label, *cells))
     return Table(
         ("method", *(f"{count} shown" for count in counts)),
         tuple(rows),
-        f"Success in percent, mean ± standard deviation over {', '.join(summary.tasks)}; in parentheses Wilson's 95% "
-        "interval of all n executions together.",
+        f"{_configuration(summary.variants)}"
+        f"Success in percent, mean ± standard deviation over {', '.join(summary.tasks)}; in parentheses "
+        f"{INTERVAL}, of all n scenes together.",
     )
 
 
@@ -157,22 +175,27 @@ def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> T
     """How many failures of each method each stage caused."""
     keys = {row.key for row in episodes}
     known = [failure for failure in failures if failure.key in keys]
-    methods = sorted({row.variant.method for row in episodes}, key=METHOD_NAMES.index)
+    kinds = sorted(
+        {(row.variant.config, row.variant.method) for row in episodes},
+        key=lambda kind: (kind[0], METHOD_NAMES.index(kind[1])),
+    )
+    apart = len({config for config, _ in kinds if config}) > 1
     stages_met = [stage for stage in STAGES if any(failure.stage == stage for failure in known)]
     rows = []
-    for method in methods:
-        executions = [row for row in episodes if row.variant.method == method]
+    for config, method in kinds:
+        executions = [row for row in episodes if (row.variant.config, row.variant.method) == (config, method)]
         lost = sum(not row.success for row in executions)
-        stages = [failure.stage for failure in known if failure.variant.method == method]
+        stages = [one.stage for one in known if (one.variant.config, one.variant.method) == (config, method)]
         cells = [f"{stages.count(stage)} ({stages.count(stage) / lost:.0%})" if lost else NONE for stage in stages_met]
-        rows.append((method, str(len(executions)), str(lost), *cells, str(lost - len(stages))))
+        label = f"{method} ({config})" if apart and config else method
+        rows.append((label, str(len(executions)), str(lost), *cells, str(lost - len(stages))))
     return Table(
         ("method", "executions", "failed", *(f"{stage} off" for stage in stages_met), "not examined"),
         tuple(rows),
-        "Each failed episode is laid at the first stage that is to blame when parts are replaced by the truth, one by "
-        "one: execution (the demonstrator's own trajectory, played back, fails), keypoints (with the true ones it "
-        "succeeds), regression (one of its candidates succeeds by itself), else samples. A closed-loop policy has no "
-        "such stages.",
+        "Each failure is attributed to the first stage that explains it when stages are replaced by the truth in "
+        "this order: execution (the demonstrator's own trajectory fails), keypoints (the method succeeds with the true "
+        "ones), regression (one of its candidates succeeds alone), else samples. A closed-loop policy has no such "
+        "stages.",
     )
 
 
@@ -184,7 +207,8 @@ def invocation_table(invocations: Sequence[Invocation], episodes: Sequence[Episo
     models = sorted({row.variant.model for row in episodes if row.variant.model})
     shared: dict[tuple, float] = {}  # methods that share samples each count the time of sampling
     for row in episodes:
-        samples = row.scene, row.variant.demos, row.variant.downsampling, row.variant.frames, row.variant.layout
+        own = row.variant
+        samples = row.scene, own.demos, own.downsampling, own.keypoints, own.frames, own.layout, own.model
         shared[samples] = max(shared.get(samples, 0.0), row.seconds)
     planning = sum(shared.values()) / 3600
     physics = sum(row.physics_seconds for row in episodes) / 3600
@@ -197,11 +221,6 @@ def invocation_table(invocations: Sequence[Invocation], episodes: Sequence[Episo
         if invocations
         else "Nothing is known of the commands that wrote these rows.",
     )
-
-
-def _both(summary: Summary, one: Variant, other: Variant) -> tuple[list[float], list[float]]:
-    """The success rates of both in the tasks that both were tried in."""
-    return summary.of_tasks(one, other), summary.of_tasks(other, one)
 
 
 def _cell(rate: Rate | None, best: float) -> str:
@@ -217,8 +236,17 @@ def _spread(summary: Summary, variant: Variant, stars: str = "") -> str:
     return f"{100 * mean:.1f}{stars.replace('*', chr(92) + '*')} ± {100 * deviation:.1f}"
 
 
-def _paper_average(variant: Variant, tasks: Sequence[str]) -> str:
-    rates = [rate for task in tasks if (rate := paper.table1(variant.method, task)) is not None]
+def _configuration(variants: Sequence[Variant]) -> str:
+    """A sentence that names the configuration, and the descriptors where they are not the paper's DINO."""
+    named = [config for config in configs(variants) if config]
+    features = sorted({one.features for one in variants if one.features and one.keypoints} - {"auto"})
+    words = [f"Configuration: {' and '.join(named)}"] if named else []
+    words += [f"descriptors: {' and '.join(features)}"] if features else []
+    return f"{'; '.join(words)}. " if words else ""
+
+
+def _paper_average(variant: Variant, tasks: Sequence[str], beside: Sequence[Variant]) -> str:
+    rates = [rate for task in tasks if (rate := paper.told(variant, task, beside)) is not None]
     return "{:.0f} ± {:.0f}".format(*mean_and_deviation(rates)) if rates else NONE
 
 
@@ -241,6 +269,8 @@ def _with_tests(summary: Summary) -> list[Table]:
 
 def _downsampling(summary: Summary) -> list[Table]:
     table = sweep_table(summary, "downsampling", lambda variant: variant.downsampling)
+    if not paper.is_told(summary.variants):
+        return [table]
     told = [str(paper.DOWNSAMPLING[variant.downsampling]) for variant in summary.variants]
     row = ("paper, average of five tasks", *told)
     return [Table(table.head, (*table.rows, row), table.note)]

@@ -1,4 +1,4 @@
-"""What a trained method learned: how the loss fell, and samples beside demonstrations."""
+"""Figure about a trained method: the loss, and samples beside demonstrations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LOSS_WINDOW = 20  # steps over which the drawn loss is averaged
 
 
 def keep_training_picture(out: Path, task: str, variant: Variant, policy: TrainedPolicy) -> None:
-    """Draw what ``policy`` learned of ``task`` into the run's folder ``out``, unless that is there already."""
+    """Write the figure about ``policy`` to the run's folder ``out``, unless it exists."""
     path = out / training_file(task, variant)
     if not path.exists():
         write_whole(path, training_picture(policy))

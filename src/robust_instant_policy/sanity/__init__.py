@@ -3,6 +3,8 @@
 from robust_instant_policy.sanity.envelope import Envelope
 from robust_instant_policy.sanity.finding import DemonstrationError, EnvelopeError, Finding, GeometryError, errors
 from robust_instant_policy.sanity.report import Reference, SetReport, check_demonstrations
+from robust_instant_policy.sanity.surroundings import Surroundings
+from robust_instant_policy.sanity.view import View
 
 __all__ = [
     "DemonstrationError",
@@ -12,6 +14,8 @@ __all__ = [
     "GeometryError",
     "Reference",
     "SetReport",
+    "Surroundings",
+    "View",
     "check_demonstrations",
     "errors",
 ]

@@ -87,8 +87,9 @@ def consistency(solid: Sequence[FloatArray]) -> Consistency:
     best = score.argmax(axis=0)
     likeness = np.zeros(count)
     for arm, moment in enumerate(best):
-        own = stack[:, moment, arm]
-        others = (own.sum(axis=0) - own) / (count - 1)
-        norms = np.linalg.norm(own, axis=1) * np.linalg.norm(others, axis=1)
-        likeness += (own * others).sum(axis=1) / np.maximum(norms, 1e-9) / len(best)
+        usual = stack[:, moment, arm]
+        others = (usual.sum(axis=0) - usual) / (count - 1)
+        near = stack[:, max(moment - 1, 0) : moment + 2, arm]  # a demonstration may be a moment early or late
+        norms = np.linalg.norm(near, axis=-1) * np.linalg.norm(others, axis=-1)[:, None]
+        likeness += ((near * others[:, None]).sum(axis=-1) / np.maximum(norms, 1e-9)).max(axis=1) / len(best)
     return Consistency(float(score.max(axis=0).clip(0).mean()), likeness)

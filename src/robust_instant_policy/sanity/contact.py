@@ -21,14 +21,14 @@ class Contact:
 
     ``path`` is the smallest gap over the path between the fingers and a raised surface (0: it passes through what
     the image shows there); ``grasps (G,)`` the gaps where grippers close; ``lowest`` the smallest height of a
-    fingertip above the table, ``lowest_palm`` that of a palm; ``buried`` the largest depth of a palm behind a
-    raised surface.
+    fingertip above the table, ``lowest_gripper_point`` that of a gripper point; ``buried`` the largest depth of
+    a gripper point behind a raised surface.
     """
 
     path: float
     grasps: FloatArray
     lowest: float
-    lowest_palm: float
+    lowest_gripper_point: float
     buried: float
 
 
@@ -36,12 +36,12 @@ class Contact:
 class GripperPath:
     """The steps of a trajectory that are compared with images.
 
-    ``fingers (M, 3)`` points between the fingertips, ``palms (P, 3)``, ``tips (2P, 3)`` and ``closings (G, 3)``, the
-    middle between the fingertips where a gripper closes.
+    ``fingers (M, 3)`` points between the fingertips, ``gripper_points (P, 3)``, ``tips (2P, 3)`` and
+    ``closings (G, 3)``, the middle between the fingertips where a gripper closes.
     """
 
     fingers: FloatArray
-    palms: FloatArray
+    gripper_points: FloatArray
     tips: FloatArray
     closings: FloatArray
 
@@ -72,12 +72,12 @@ def gaps(view: View, points: FloatArray) -> FloatArray:
 
 def contact(view: View, path: GripperPath) -> Contact:
     """How ``path`` lies to the scene of ``view``."""
-    behind, raised = view.behind_surface(path.palms)
+    behind, raised = view.behind_surface(path.gripper_points)
     buried = behind[raised & np.isfinite(behind)]
     return Contact(
         path=float(gaps(view, path.fingers).min()),
         grasps=gaps(view, path.closings),
         lowest=float(view.above_plane(path.tips).min()),
-        lowest_palm=float(view.above_plane(path.palms).min()),
+        lowest_gripper_point=float(view.above_plane(path.gripper_points).min()),
         buried=float(buried.max(initial=0.0)),
     )

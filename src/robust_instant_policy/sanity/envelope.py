@@ -17,6 +17,7 @@ STEP_FACTOR, STEP_MARGIN_M = 1.5, 0.05  # on the longest demonstrated step
 TURN_FACTOR, TURN_MARGIN_RAD = 1.5, np.deg2rad(25.0)  # on the largest demonstrated turn of a step
 TILT_MARGIN_RAD = np.deg2rad(25.0)  # on how far the approach leaned away from its mean direction
 SIDE_FACTOR, SIDE_MARGIN_M = 0.15, 0.005  # on the sides of the gripper's triangle
+FEW = 3.0  # by which margins widen, over the number of demonstrations less one
 LENGTH_FACTOR = 2.0  # on the longest demonstrated path
 DEGREES = 180 / np.pi  # in a radian
 
@@ -25,17 +26,20 @@ DEGREES = 180 / np.pi  # in a radian
 class Envelope:
     """Limits of a plan's numbers, margins included; A arms.
 
-    ``lower`` and ``upper (A, 3)``: corners of the box that holds palm and fingertips, metres, world; ``lowest (A,)``
-    height of a fingertip above the table, metres; ``step (A,)`` metres and ``turn (A,)`` rad from one step to the
-    next, of ``steps`` steps; ``approach (A, 3)`` mean direction and ``tilt (A,)`` rad around it; ``sides (A, 3)`` of
-    the gripper's triangle, metres; ``length (A,)`` of the path, metres; ``changes`` the sequences of gripper states,
+    ``lower`` and ``upper (A, 3)``: corners of the box that holds gripper point and fingertips, metres, world, with
+    the ``margin``, metres; ``lowest (A,)`` height of a fingertip above the table, metres; ``step (A,)`` metres,
+    ``detour (A,)`` metres from the way between its neighbours and ``turn (A,)`` rad from one step to the next, of
+    ``steps`` steps; ``approach (A, 3)`` mean direction and ``tilt (A,)`` rad around it; ``sides (A, 3)`` of the
+    gripper's triangle, metres; ``length (A,)`` of the path, metres; ``changes`` the sequences of gripper states,
     one for each arm, that were demonstrated.
     """
 
     lower: FloatArray
     upper: FloatArray
+    margin: float
     lowest: FloatArray
     step: FloatArray
+    detour: FloatArray
     turn: FloatArray
     approach: FloatArray
     tilt: FloatArray
@@ -47,7 +51,11 @@ class Envelope:
 
     @classmethod
     def of(cls, trajectories: Sequence[Trajectory], plane: FloatArray) -> Envelope:
-        """Of demonstrated ``trajectories`` with the same number of arms, over the table's ``plane (4,)``."""
+        """Of demonstrated ``trajectories`` with the same number of arms, over the table's ``plane (4,)``.
+
+        The extremes of few demonstrations bound a new one less: margins that protect nothing but plausibility widen by
+        1 + `FEW` / (I - 1), those of height and of the gripper's shape do not.
+        """
         thinned = [downsample(trajectory) for trajectory in trajectories]
         points = np.concatenate([trajectory.triplets for trajectory in trajectories])  # (T, A, 3, 3)
         directions = np.concatenate([approaches(trajectory) for trajectory in trajectories])
@@ -56,15 +64,19 @@ class Envelope:
         leaning = np.arccos(np.clip((directions * mean).sum(axis=-1), -1, 1)).max(axis=0)
         heights = points[:, :, 1:] @ plane[:3] + plane[3]
         steps = np.array([_largest(step_lengths(t)) for t in thinned]).max(axis=0)
+        detours = np.array([_largest(step_detours(t)) for t in thinned]).max(axis=0)
         turns = np.array([_largest(step_turns(t)) for t in thinned]).max(axis=0)
+        wider = 1 + FEW / max(len(trajectories) - 1, 1)
         return cls(
-            lower=points.min(axis=(0, 2)) - POSITION_MARGIN_M,
-            upper=points.max(axis=(0, 2)) + POSITION_MARGIN_M,
+            lower=points.min(axis=(0, 2)) - wider * POSITION_MARGIN_M,
+            upper=points.max(axis=(0, 2)) + wider * POSITION_MARGIN_M,
+            margin=wider * POSITION_MARGIN_M,
             lowest=heights.min(axis=(0, 2)) - HEIGHT_MARGIN_M,
-            step=STEP_FACTOR * steps + STEP_MARGIN_M,
-            turn=TURN_FACTOR * turns + TURN_MARGIN_RAD,
+            step=steps + wider * ((STEP_FACTOR - 1) * steps + STEP_MARGIN_M),
+            detour=detours + wider * ((STEP_FACTOR - 1) * detours + STEP_MARGIN_M),
+            turn=turns + wider * ((TURN_FACTOR - 1) * turns + TURN_MARGIN_RAD),
             approach=mean,
-            tilt=leaning + TILT_MARGIN_RAD,
+            tilt=leaning + wider * TILT_MARGIN_RAD,
             sides=np.median(triangle_sides(points), axis=0),
             length=LENGTH_FACTOR * np.array([step_lengths(t).sum(axis=0) for t in thinned]).max(axis=0),
             steps=max(len(t) for t in thinned),
@@ -104,12 +116,14 @@ class Envelope:
             """Report the step with the largest of ``values`` where it exceeds ``limit``."""
             if len(values) and values.max() > limit:
                 step = int(values.argmax())
-                told = words.format(step=step, next=step + 1, value=unit * values[step], limit=unit * limit)
+                told = words.format(
+                    step=step, next=step + 1, after=step + 2, value=unit * values[step], limit=unit * limit
+                )
                 found.append(_outside(kind, name + told, values[step], limit, step))
 
-        outside = np.maximum(self.lower[arm] - points, points - self.upper[arm]).max(axis=(1, 2)) + POSITION_MARGIN_M
+        outside = np.maximum(self.lower[arm] - points, points - self.upper[arm]).max(axis=(1, 2)) + self.margin
         words = "position of step {step} lies {value:.2f} m outside what was demonstrated, {limit:.2f} m allowed"
-        bound("position", outside, POSITION_MARGIN_M, words)
+        bound("position", outside, self.margin, words)
         heights, lowest = (points[:, 1:] @ self.plane[:3] + self.plane[3]).min(axis=1), self.lowest[arm]
         if heights.min() < lowest:
             step = int(heights.argmin())
@@ -117,6 +131,8 @@ class Envelope:
             found.append(_outside("height", f"{words}: {lowest * 1e3:.0f} mm allowed", heights[step], lowest, step))
         words = "the gripper moves {value:.2f} m from step {step} to {next}, {limit:.2f} m allowed"
         bound("step length", lengths, self.step[arm] * stretch, words)
+        words = "the gripper leaves the way from step {step} to {after} by {value:.2f} m, {limit:.2f} m allowed"
+        bound("detour", step_detours(trajectory)[:, arm], self.detour[arm] * stretch, words)
         words = "the gripper turns {value:.0f} degrees from step {step} to {next}, {limit:.0f} degrees allowed"
         bound("turn", step_turns(trajectory)[:, arm], self.turn[arm] * stretch, words, DEGREES)
         tilts = np.arccos(np.clip(approaches(trajectory)[:, arm] @ self.approach[arm], -1, 1))
@@ -130,7 +146,7 @@ class Envelope:
         if off.max() > 0:
             step, side = (int(i) for i in np.unravel_index(int(off.argmax()), off.shape))
             value, usual = sides[step, side], self.sides[arm, side]
-            what = "between the fingertips" if side == 0 else "between palm and fingertip"
+            what = "between the fingertips" if side == 0 else "between gripper point and fingertip"
             words = f"the gripper is {value * 1e3:.0f} mm {what} at step {step}, {usual * 1e3:.0f} mm demonstrated"
             found.append(_outside("gripper shape", name + words, value, usual, step))
         if (total := lengths.sum()) > (limit := self.length[arm]):
@@ -144,8 +160,13 @@ def step_lengths(trajectory: Trajectory) -> FloatArray:
     return np.linalg.norm(np.diff(trajectory.triplets[:, :, 1:].mean(axis=2), axis=0), axis=-1)
 
 
+def step_detours(trajectory: Trajectory) -> FloatArray:
+    """Metres ``(T - 2, A)`` from the middle of the fingertips at a step to the middle of its neighbours'."""
+    return np.linalg.norm(np.diff(trajectory.triplets[:, :, 1:].mean(axis=2), n=2, axis=0), axis=-1) / 2
+
+
 def approaches(trajectory: Trajectory) -> FloatArray:
-    """Unit vectors ``(T, A, 3)`` from the palm to the middle of the fingertips; zero where they coincide."""
+    """Unit vectors ``(T, A, 3)`` from the gripper point to the middle of the fingertips; zero where they coincide."""
     forward = trajectory.triplets[:, :, 1:].mean(axis=2) - trajectory.triplets[:, :, 0]
     return forward / np.maximum(np.linalg.norm(forward, axis=-1, keepdims=True), 1e-9)
 
@@ -162,9 +183,9 @@ def step_turns(trajectory: Trajectory) -> FloatArray:
 
 
 def triangle_sides(points: FloatArray) -> FloatArray:
-    """Lengths ``(..., 3)`` of fingertip to fingertip and palm to each fingertip, of ``points (..., 3, 3)``."""
-    palm, left, right = points[..., 0, :], points[..., 1, :], points[..., 2, :]
-    return np.stack([np.linalg.norm(d, axis=-1) for d in (left - right, left - palm, right - palm)], axis=-1)
+    """Lengths ``(..., 3)`` of fingertip to fingertip and gripper point to each fingertip, of ``points (..., 3, 3)``."""
+    gripper, left, right = points[..., 0, :], points[..., 1, :], points[..., 2, :]
+    return np.stack([np.linalg.norm(d, axis=-1) for d in (left - right, left - gripper, right - gripper)], axis=-1)
 
 
 def gripper_changes(trajectory: Trajectory) -> tuple[tuple[int, ...], ...]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration
-from robust_instant_policy.sanity.envelope import gripper_changes, triangle_sides
+from robust_instant_policy.sanity.envelope import gripper_changes, step_turns, triangle_sides
 from robust_instant_policy.sanity.finding import Finding, Severity
 
 STATE_TOLERANCE = 1e-3  # of a gripper state around 0 and 1
@@ -20,6 +20,7 @@ SMALLEST_GRIPPER_M = 0.004
 FARTHEST_REACH_M = 10.0  # from the world's origin
 UNITS = (("millimetres", 1000.0), ("centimetres", 100.0), ("inches", 39.37))
 SHAPE_CHANGE = 0.1  # relative difference of the gripper's triangle between demonstrations
+FASTEST_TURN_RAD_S = 2 * np.pi  # of the gripper, in most demonstrations
 MIN_MOTION_M = 0.005  # over a demonstration
 COMMON = 0.7  # share of the demonstrations that makes a rule
 
@@ -37,7 +38,11 @@ def check_episodes(demonstrations: Sequence[Demonstration]) -> list[Finding]:
     if len(tasks) > 1:
         named = ", ".join(f"{count} of {task or 'no task'!r}" for task, count in tasks.most_common(4))
         found.append(_error("tasks", f"demonstrations of several tasks are mixed: {named}; fit one task at a time"))
+    if max(arms) > 1:
+        words = "which arm is which was not checked: paths with exchanged arms look alike"
+        found.append(Finding("arms", "unchecked", words))
     found += _states(demonstrations) + _units(demonstrations) + _copies(demonstrations)
+    found += _turns(demonstrations)
     return found + _grasps(demonstrations) + _order_of_changes(demonstrations)
 
 
@@ -83,7 +88,7 @@ def _states(demonstrations: Sequence[Demonstration]) -> list[Finding]:
 def _grasps(demonstrations: Sequence[Demonstration]) -> list[Finding]:
     if any(np.ptp(demonstration.trajectory.gripper_state, axis=0).any() for demonstration in demonstrations):
         return []
-    words = "no gripper opens or closes in any demonstration: what it grasps was not checked"
+    words = "no gripper opens or closes in any demonstration: neither grasps nor inverted states were checked"
     return [Finding("gripper state", "warning", f"{words}; if the task needs a grasp, its state was not recorded")]
 
 
@@ -105,6 +110,18 @@ def _units(demonstrations: Sequence[Demonstration]) -> list[Finding]:
             words = f"the gripper of {_these(off)} has another shape than the others'; was another tool recorded?"
             found.append(Finding("gripper shape", "warning", words, {"demonstration": float(off[0])}))
     return found
+
+
+def _turns(demonstrations: Sequence[Demonstration]) -> list[Finding]:
+    fastest = [float(step_turns(d.trajectory).max(initial=0.0)) * d.rate_hz for d in demonstrations]
+    usual = float(np.median(fastest))
+    if usual < FASTEST_TURN_RAD_S:
+        return []
+    words = (
+        f"grippers turn by up to {np.rad2deg(usual):.0f} degrees a second, which no arm does: rotations are read "
+        "wrongly, such as Euler angles in degrees taken for radians"
+    )
+    return [Finding("rotation", "error", words, {"turn_rad_s": usual}, "degrees read as radians")]
 
 
 def _copies(demonstrations: Sequence[Demonstration]) -> list[Finding]:

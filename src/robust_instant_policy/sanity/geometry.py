@@ -18,7 +18,7 @@ from robust_instant_policy.sanity.view import View, coarse
 TOUCH_M = 0.03  # gap below which a path, or a closing gripper, touches a surface: fingers beside a thin thing
 TOUCH_DEVIATIONS = 4.0  # of the depth's noise, added to that
 BELOW_TABLE_M = 0.015  # that a fingertip may lie below the table's plane: fingers press on tables
-BURIED_M = 0.03  # that a palm may lie behind a surface of the start image
+BURIED_M = 0.03  # that a gripper point may lie behind a surface of the start image
 MIN_SHARE = 0.5  # of the demonstrations that must agree with their images
 FAR_M = 0.06  # gap from which a path does not touch at all, when hypotheses are compared
 REPEATED = 1.5  # weight of consistency beside those shares
@@ -38,8 +38,8 @@ class Evidence:
     """How well paths and images fit, as shares of the demonstrations (0 to 1).
 
     ``touching``: the path meets a raised surface; ``grasping``: so does the gripper where it closes (share of all
-    closings); ``clear``: no fingertip is below the table and no palm inside a surface; ``level``: the camera is above
-    the table and the readings lie on one plane.
+    closings); ``clear``: no fingertip is below the table and no gripper point inside a surface; ``level``: the camera
+    is above the table and the readings lie on one plane.
     """
 
     contacts: tuple[Contact, ...]
@@ -99,7 +99,7 @@ def touch_distance(view: View) -> float:
 
 def fits(contact: Contact, view: View) -> bool:
     """Whether a path stays above the table and outside of what the image shows."""
-    lowest = min(contact.lowest, contact.lowest_palm)
+    lowest = min(contact.lowest, contact.lowest_gripper_point)
     above = lowest > -(BELOW_TABLE_M + 2 * view.noise) or not view.is_support
     return above and contact.buried < BURIED_M
 

@@ -55,6 +55,7 @@ def along_axis(observation: Observation) -> Observation:
     return replace(observation, depth=(observation.depth / np.linalg.norm(rays, axis=-1)).astype(np.float32))
 
 
+SMALLEST_RAD = 2 * np.pi * np.deg2rad(1.0)  # above what any rotation becomes whose radians are read as degrees
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 TURNS = (("turned upside down", -1, -1), ("mirrored left to right", 1, -1), ("flipped top to bottom", -1, 1))
 
@@ -105,11 +106,19 @@ DISPLACED = tuple(
 ALL = OF_POSE + OF_INTRINSICS + OF_DEPTH + OF_IMAGES
 
 
-def reordered_quaternions(triplets: FloatArray) -> Iterator[tuple[str, FloatArray]]:
-    """Each other order of quaternions, and ``triplets (N, 3, 3)`` with the rotation that they have if read in it."""
+def rotations_read_otherwise(triplets: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    """Each other reading of a rotation's numbers, and ``triplets (N, 3, 3)`` with the rotation that they give then."""
     triangle = GripperTriangle.from_triplets(triplets)
     poses = triangle.poses(triplets)
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    for order, roll in (("wxyz", -1), ("xyzw", 1)):
-        poses[:, :3, :3] = Rotation.from_quat(np.roll(quaternions, roll, axis=1)).as_matrix()
-        yield f"quaternions read as {order}", triangle.triplets(poses)
+    now = Rotation.from_matrix(poses[:, :3, :3])
+    angles = now.as_euler("xyz")
+    readings = []
+    if now.magnitude().max() < SMALLEST_RAD:
+        readings.append(("Euler angles read as radians, not degrees", Rotation.from_euler("xyz", np.rad2deg(angles))))
+    readings += [
+        (f"quaternions read as {order}", Rotation.from_quat(np.roll(now.as_quat(), roll, axis=1)))
+        for order, roll in (("wxyz", -1), ("xyzw", 1))
+    ]
+    for words, rotation in readings:
+        poses[:, :3, :3] = rotation.as_matrix()
+        yield words, triangle.triplets(poses)

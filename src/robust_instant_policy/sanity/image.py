@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.pointcloud import MILLIMETRES_ABOVE
 from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.view import View
@@ -14,6 +15,7 @@ MIN_READINGS = 0.05  # share of the pixels that must have a steady depth
 UNIFORM = 3.0  # of 255; a colour image that varies less shows nothing
 SQUARE_PIXELS = 0.1  # relative difference of fx and fy that no camera has
 CENTRED = 0.2  # of the image's size that the principal point may lie from its middle
+BAND_M, BAND_ON_TABLE, BAND_ROWS = 0.03, 0.02, 3  # height off the table, share of a row still on it, rows of the grid
 TILT_ERROR_RAD, TILT_WARNING_RAD = np.deg2rad(4.0), np.deg2rad(2.0)  # of the table against the world's z axis
 
 
@@ -36,6 +38,12 @@ def check_image(view: View) -> list[Finding]:
     if readings < MIN_READINGS:
         words = f"{readings:.0%} of the depth image has a steady reading; check the camera's depth stream"
         return [*found, Finding("depth", "error", words, {"readings": readings})]
+    for lines, what in ((view.height, "rows"), (view.height.T, "columns")):
+        if band := _band(lines):
+            first, last = (edge * view.every for edge in band)
+            words = f"depth is off over the whole of {what} {first} to {last}, and right beside them"
+            numbers = {"first": float(first), "last": float(last)}
+            return [*found, Finding("depth", "error", f"{words}; check the depth stream", numbers, f"a band of {what}")]
     raw = observation.depth[np.isfinite(observation.depth) & (observation.depth > 0)]
     if (median := float(np.median(raw))) > MILLIMETRES_ABOVE:
         words = f"depth has a median of {median:.0f}: it is in millimetres, and read as such; store metres"
@@ -54,6 +62,20 @@ def check_image(view: View) -> list[Finding]:
         advice = "; the camera's pose is turned, or the depth is wrong"
         found.append(Finding("table", severity, words + advice, {"tilt": view.tilt}, "camera turned"))
     return found
+
+
+def _band(height: FloatArray) -> tuple[int, int] | None:
+    """First and last row of a band that lies off the table over its whole width, with rows on it on both sides.
+
+    ``height (h, w)`` above the table, metres, NaN without a reading.
+    """
+    on_table = (np.abs(height) < BAND_M).mean(axis=1)
+    off = np.flatnonzero(on_table < BAND_ON_TABLE)
+    inner = np.flatnonzero(on_table > 0.5)
+    if not len(inner):
+        return None
+    off = off[(off > inner[0]) & (off < inner[-1])]
+    return (int(off[0]), int(off[-1])) if len(off) >= BAND_ROWS else None
 
 
 def check_each_image(views: Sequence[View]) -> list[Finding]:

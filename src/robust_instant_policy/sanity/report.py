@@ -21,9 +21,11 @@ from robust_instant_policy.sanity.image import check_each_image, check_image
 from robust_instant_policy.sanity.images import (
     ONE_SCENE_M,
     check_contact,
+    check_direction,
+    check_fingers,
     check_openings,
-    check_palms,
-    check_quaternions,
+    check_rotations,
+    check_tool_frame,
     scene_spread,
 )
 from robust_instant_policy.sanity.scene import TABLE_M, check_against_scenery, check_table
@@ -116,16 +118,16 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
     if broken or any(finding.kind == "depth" for finding in errors(found)):
         return SetReport(tuple(found), None, None)
 
-    found += check_quaternions(demonstrations)
     trajectories = [demonstration.trajectory for demonstration in demonstrations]
     paths = [GripperPath.of(trajectory) for trajectory in trajectories]
     poses = gripper_poses(trajectories)
     as_is = evidence(views, paths, poses)
     cameras = _check_cameras(views)
-    found += cameras
+    found += cameras + check_rotations(demonstrations, as_is)
     found += check_contact(demonstrations, views, paths, poses, as_is)
     edges = [agreement(view) for view in views]
-    found += check_palms(as_is) + check_openings(demonstrations, views)
+    found += check_tool_frame(demonstrations, views, as_is) + check_openings(demonstrations, views)
+    found += check_fingers(demonstrations, views) + check_direction(demonstrations, views)
     found += check_agreement(views, edges)
     spread = scene_spread(views)
     if len(views) > 1 and np.isfinite(spread) and spread < ONE_SCENE_M:

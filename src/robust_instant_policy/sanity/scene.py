@@ -11,13 +11,10 @@ from robust_instant_policy.sanity.hypotheses import OF_DEPTH, OF_IMAGES, OF_POSE
 from robust_instant_policy.sanity.scenery import CameraChange, Likeness, Scenery, camera_change
 from robust_instant_policy.sanity.view import View
 
-SAME_PICTURE = 0.9  # share of the scenery's depth that must agree, of what the demonstrations' own agree
-SAME_TEXTURE = 0.5  # of the demonstrations' own correlation
-SURE_TEXTURE = 0.95  # of it, below which an image may be turned round
+SAME_PICTURE = 0.9  # share, of what the demonstrations' own images agree, that an image of the same scenery agrees
+SAME_TEXTURE = 0.5  # the same of the correlation of texture, which light and shadows lower
+BETTER = 0.1  # by which the sum of both shares must be larger under a hypothesis that explains a picture
 TABLE_M, TABLE_RAD = 0.02, np.deg2rad(2.0)  # that the table may differ from the demonstrations'
-RESTORED = 0.6  # of the demonstrations' own correlation, that a displacement must restore
-MOVED_CLEARER = 0.1  # and by which it must be better than without
-CLEARER = 0.05  # by which a correlation or share must be better to explain a picture
 MUCH_TEXTURE = 0.8  # from which texture survives another camera's resolution
 SAME_IN_WORLD = 0.3  # of the demonstrations' own correlation, of texture on the table seen by another camera
 MISSING = 0.2  # share of the scenery without depth that no camera noise explains
@@ -45,9 +42,8 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
         words = "red and blue are exchanged: the image is BGR, the demonstrations' are RGB, or the other way round"
         found.append(Finding("scenery", "error", words, cause="BGR"))
     same_depth = like.depth >= SAME_PICTURE * scenery.agreed
-    moved = _shifted(view, scenery, like) if scenery.textured and small else None
-    turned = _turned(view, scenery, like, same_depth) if small else None
     same_texture = not scenery.textured or like.texture >= SAME_TEXTURE * scenery.texture
+    explained = _explain(view, scenery, like) if small else None
     numbers = {
         "same_depth": like.depth,
         "texture": like.texture,
@@ -55,14 +51,15 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
         "turned": change.turned,
         "intrinsics": change.intrinsics,
     }
-    if same_depth and same_texture and not moved and not turned:
+    if same_depth and same_texture and not explained:
         if small:
             return found
         cause = _name_calibration(scenery.reference, observation, change)
         words = f"the picture is the demonstrations', but its camera is said to be {change}"
         return [*found, Finding("camera", "error", f"{words}: {cause}", numbers, cause)]
     if small:
-        return [*found, _picture_changed(view, scenery, like, same_depth, moved, turned, numbers)]
+        cause, words = explained or _unexplained(scenery, like, same_depth)
+        return [*found, Finding("scenery", "error", words, {**numbers, "ratio": like.ratio}, cause)]
     # Another camera, or one that was moved and calibrated: only the world can be compared.
     there = scenery.texture_in_world(view)
     if scenery.texture >= MUCH_TEXTURE and there < SAME_IN_WORLD * scenery.texture:
@@ -85,73 +82,57 @@ def _name_calibration(old: Observation, new: Observation, change: CameraChange) 
     return "the camera pose is wrong, here or in the demonstrations; calibrate the camera once for both"
 
 
-def _picture_changed(
-    view: View,
-    scenery: Scenery,
-    like: Likeness,
-    same_depth: bool,
-    moved: tuple[int, int] | None,
-    turned: tuple[str, str] | None,
-    numbers: dict[str, float],
-) -> Finding:
-    """The camera is said to be the same, and the picture is not: name what restores it."""
-    if turned:
-        return Finding("scenery", "error", turned[1], numbers, turned[0])
-    texture_holds = scenery.textured and like.texture >= SAME_TEXTURE * scenery.texture
-    if not same_depth and (texture_holds or not scenery.textured or abs(like.ratio - 1) > 0.3):
-        numbers = {**numbers, "ratio": like.ratio, "offset": like.offset}
-        for hypothesis in OF_DEPTH:
-            fixed = scenery.likeness(View.of(hypothesis.correct(view.observation)))
-            if fixed.depth >= SAME_PICTURE * scenery.agreed:
-                words = f"depth reads {like.ratio:.3g} times the demonstrations' over the same scenery"
-                cause = hypothesis.cause
-                return Finding(
-                    "scenery", "error", f"{words}; with {cause} it agrees: {hypothesis.remedy}", numbers, cause
-                )
-        words = f"depth reads {like.ratio:.3g} times the demonstrations' ({like.offset * 100:+.1f} cm)"
-        advice = (
-            "; check the depth unit and calibration, and whether the camera was moved towards or away from the table"
-        )
-        return Finding("scenery", "error", words + advice, numbers, "depth scale, or camera moved")
-    if moved:
-        cols, rows = moved
-        metres = float(np.hypot(cols, rows) * np.nanmedian(view.depth) / view.observation.intrinsics[0, 0])
-        words = f"the camera was moved: the scenery is displaced by {cols:+d}, {rows:+d} pixels ({metres * 100:.0f} cm)"
-        advice = "; calibrate it anew, or put it back"
-        return Finding("scenery", "error", words + advice, {**numbers, "shift": metres}, "camera moved")
-    if not same_depth:
-        words = f"{like.depth:.0%} of the scenery's depth are as in the demonstrations"
-        advice = ": the camera was moved, or the depth is of another scene or stream"
-        return Finding("scenery", "error", words + advice, numbers, "camera moved")
-    words = f"the scenery looks different (texture agrees by {like.texture:.2f}, theirs by {scenery.texture:.2f})"
-    advice = ": the camera was moved, the colour image is of another stream, or the table is covered"
-    return Finding("scenery", "error", words + advice, numbers, "camera moved, or another colour image")
+def _explain(view: View, scenery: Scenery, like: Likeness) -> tuple[str, str] | None:
+    """Cause and words of the known mistake without which the picture agrees best, where it agrees clearly better."""
 
+    def score(depth: float, texture: float) -> float:
+        shares = depth / scenery.agreed, texture / scenery.texture if scenery.textured else 0.0
+        return float(np.minimum(np.nan_to_num(shares), 1.0).sum())
 
-def _turned(view: View, scenery: Scenery, like: Likeness, same_depth: bool) -> tuple[str, str] | None:
-    """Cause and message where the picture, turned round or mirrored, is the demonstrations'."""
-    if same_depth and not like.texture < SURE_TEXTURE * scenery.texture:
+    as_is = score(like.depth, like.texture)
+    if as_is > 1 + scenery.textured - BETTER:
         return None
+    found: list[tuple[float, str, str]] = []
     for hypothesis in OF_IMAGES:
         turned = scenery.likeness(View.of(hypothesis.correct(view.observation)))
         what = hypothesis.cause.removeprefix("the image ")
-        enough = max(SAME_TEXTURE * scenery.texture, like.texture + CLEARER)
-        if scenery.textured and turned.texture > enough and (same_depth or turned.depth >= like.depth - CLEARER):
+        for name, depth, texture in (
+            ("depth image", turned.depth, like.texture),
+            ("colour image", like.depth, turned.texture),
+            ("image", turned.depth, turned.texture),
+        ):
             words = (
-                f"the image is {what}: turned back, its texture agrees by {turned.texture:.2f} (now {like.texture:.2f})"
+                f"the {name} is {what}: turned back, it agrees with the demonstrations' scenery; {hypothesis.remedy}"
             )
-            return f"colour image {what}", f"{words}; {hypothesis.remedy}"
-        if turned.depth >= SAME_PICTURE * scenery.agreed and turned.depth > like.depth + CLEARER:
-            words = f"the depth image is {what}: turned back, {turned.depth:.0%} of it agree (now {like.depth:.0%})"
-            return f"depth image {what}", f"{words}; {hypothesis.remedy}"
-    return None
+            found.append((score(depth, texture), f"{name} {what}", words))
+    for hypothesis in OF_DEPTH:
+        fixed = scenery.likeness(View.of(hypothesis.correct(view.observation)))
+        words = (
+            f"depth reads {like.ratio:.3g} times the demonstrations' over the same scenery; with {hypothesis.cause} it "
+            f"agrees: {hypothesis.remedy}"
+        )
+        found.append((score(fixed.depth, like.texture), hypothesis.cause, words))
+    if scenery.textured:
+        cols, rows, texture = scenery.shift(view)
+        metres = float(np.hypot(cols, rows) * np.nanmedian(view.depth) / view.observation.intrinsics[0, 0])
+        words = f"the camera was moved: the scenery is displaced by {cols:+d}, {rows:+d} pixels ({metres * 100:.0f} cm)"
+        found.append((score(like.depth, texture), "camera moved", f"{words}; calibrate it anew, or put it back"))
+    best, cause, words = max(found, key=lambda one: one[0])
+    return (cause, words) if best > as_is + BETTER else None
 
 
-def _shifted(view: View, scenery: Scenery, like: Likeness) -> tuple[int, int] | None:
-    """By how many columns and rows the picture is displaced, None where its texture fits best as it is."""
-    cols, rows, there = scenery.shift(view)
-    restored = there > max(RESTORED * scenery.texture, like.texture + MOVED_CLEARER)
-    return (cols, rows) if (cols or rows) and restored else None
+def _unexplained(scenery: Scenery, like: Likeness, same_depth: bool) -> tuple[str, str]:
+    """Cause and words where the camera is said to be the same, the picture is not, and no known mistake explains it."""
+    if not same_depth and abs(like.ratio - 1) * np.nanmedian(scenery.depth) > TABLE_M:
+        words = f"depth reads {like.ratio:.3g} times the demonstrations' ({like.offset * 100:+.1f} cm)"
+        advice = "; the table is lower or higher, the camera was moved, or the depth is not calibrated"
+        return "depth scale, camera or table moved", words + advice
+    if not same_depth:
+        words = f"{like.depth:.0%} of the scenery's depth are as in the demonstrations"
+        return "camera moved", f"{words}: the camera was moved, or the depth is of another scene or stream"
+    words = f"the scenery looks different (texture agrees by {like.texture:.2f}, theirs by {scenery.texture:.2f})"
+    advice = ": the camera was moved, the colour image is of another stream, or the table is covered"
+    return "camera moved, or another colour image", words + advice
 
 
 def check_table(view: View, plane: FloatArray, centre: FloatArray) -> list[Finding]:
@@ -168,5 +149,5 @@ def check_table(view: View, plane: FloatArray, centre: FloatArray) -> list[Findi
         f"turned by {np.rad2deg(angle):.1f} degrees"
     )
     numbers = {"table_offset": offset, "table_angle": angle}
-    advice = "; the camera's pose or the depth is wrong"
+    advice = "; the camera's pose or the depth is wrong, or the table was moved"
     return [Finding("table", "error", words + advice, numbers, "camera pose or depth: the table moved")]

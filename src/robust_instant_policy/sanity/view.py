@@ -22,6 +22,8 @@ MUCH_BELOW = 0.3  # share of the readings below a plane that make it no table
 MIN_POINTS = 100  # readings below which an image says nothing
 PLANE_SEED = 0
 FAR_AWAY_M = 1e3
+COLUMN_SPACINGS = 1.0  # of the grid's points on the surface, between a point and one measured straight above it
+COVER_M = 0.005  # of surface above a point that is inside a thing
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +109,20 @@ class View:
     def tree(self) -> cKDTree:
         """Nearest raised point; where nothing is raised, one far away."""
         return cKDTree(self.raised_points if len(self.raised_points) else np.full((1, 3), FAR_AWAY_M))
+
+    @cached_property
+    def columns(self) -> cKDTree:
+        """Nearest raised point seen from above."""
+        return cKDTree(self.raised_points[:, :2] if len(self.raised_points) else np.full((1, 2), FAR_AWAY_M))
+
+    def covered(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Whether a surface was measured straight above each of ``points (N, 3)``."""
+        if not len(self.raised_points):
+            return np.zeros(len(points), dtype=bool)
+        spacing = self.every * float(np.nanmedian(self.depth)) / self.observation.intrinsics[0, 0]
+        distance, nearest = self.columns.query(points[:, :2])
+        over = self.above_plane(self.raised_points[nearest]) - self.above_plane(points)
+        return (distance < COLUMN_SPACINGS * spacing) & (over > COVER_M + 2 * self.noise)
 
     def above_plane(self, points: FloatArray) -> FloatArray:
         """Heights ``(...)`` of ``points (..., 3)`` above the table, metres."""

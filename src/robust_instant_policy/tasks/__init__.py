@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from robust_instant_policy.errors import MissingExtraError, UnknownNameError
+from robust_instant_policy.tasks.level import make_level
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image, Task
 
 
@@ -27,6 +28,7 @@ class Family:
 
 FAMILIES = (
     Family("maniskill", "sim", "", ("pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet")),
+    Family("maniskill", "sim", "", ("push-cube-anywhere", "stack", "wipe", "sort")),  # relations between things
     Family(
         "aloha",
         "aloha",
@@ -34,13 +36,18 @@ FAMILIES = (
         ("aloha-pick-banana", "aloha-hang", "aloha-cup-upright", "aloha-sweep", "aloha-pick-place"),
     ),
 )
+# Those with a second set of objects, which no demonstration shows.
+UNSEEN_TASKS = (
+    "close-cabinet", "turn-faucet", "push-cube-anywhere", "stack", "wipe", "sort", "aloha-pick-place", "aloha-sweep",
+)  # fmt: skip
 TASK_NAMES = tuple(name for family in FAMILIES for name in family.names)
 
 
-def make_task(name: str, objects: str = "seen", assets: str = "code") -> Task:
+def make_task(name: str, objects: str = "seen", assets: str = "code", level: str = "paper") -> Task:
     """The task called ``name``, one of `TASK_NAMES`.
 
     ``objects="unseen"`` uses objects that no demonstration shows, for tasks with two sets;
+    ``level`` "paper" or "hard", see `level.Level`;
     ``assets="maniskill"`` uses YCB and PartNet-Mobility models, if they have been downloaded for ManiSkill.
 
     Raises `UnknownNameError` for other names, `MissingExtraError` if its simulator is not installed, and
@@ -61,12 +68,13 @@ def make_task(name: str, objects: str = "seen", assets: str = "code") -> Task:
         raise UnknownNameError(f"set of objects of {name}", objects, module.SPEC.object_sets)
     if assets not in module.SPEC.asset_sources:
         raise UnknownNameError(f"source of assets of {name}", assets, module.SPEC.asset_sources)
-    task: Task = make(module.SPEC, objects, assets)
+    task: Task = make(module.SPEC, objects, assets, make_level(level))
     return task
 
 
 __all__ = [
     "TASK_NAMES",
+    "UNSEEN_TASKS",
     "Attempt",
     "Execution",
     "FrameSink",

@@ -7,7 +7,7 @@ follow the minimum-jerk profile of human reaching (Flash and Hogan 1985).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -47,6 +47,19 @@ class Stroke:
     free: bool = False
     arm: int = 0
     waits: bool = False
+
+
+def shorter_turns(starts: FloatArray, strokes: Sequence[Stroke]) -> list[Stroke]:
+    """``strokes`` with the hands of arms rotated by half a turn where that is nearer to their ``starts (A, 4, 4)``:
+    the two fingers of a parallel gripper are interchangeable."""
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    rotated = {}
+    for stroke in strokes:
+        if stroke.arm not in rotated:
+            turn = Rotation.from_matrix(starts[stroke.arm, :3, :3].T @ stroke.poses[0, :3, :3])
+            other = turn * Rotation.from_matrix(half_turn[:3, :3])
+            rotated[stroke.arm] = bool(other.magnitude() < turn.magnitude())
+    return [replace(one, poses=one.poses @ half_turn) if rotated[one.arm] else one for one in strokes]
 
 
 def perform(

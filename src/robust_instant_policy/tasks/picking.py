@@ -46,3 +46,15 @@ def failure_of_pick(what: str, lifted: bool, held: bool, still: bool) -> str:
     if not lifted:
         return f"the {what} was not lifted"
     return "" if still else f"the {what} is held but still moving"
+
+
+def set_down(target: FloatArray, pick: Pick) -> list[Stroke]:
+    """Carry what ``pick`` holds over ``target (4, 4)``, where its frame is to be, lower it, let go and retreat."""
+    x, y, z = target[:3, 3].tolist()
+    yaw = float(np.arctan2(target[1, 0], target[0, 0]))
+    over, down = (np.array([downward(x, y, z + height, yaw)]) for height in (pick.above, pick.grasp))
+    return [
+        Stroke(over, closed=True, speed=pick.lift_speed, error=pick.error),
+        Stroke(down, closed=False, speed=pick.down_speed, error=GRASP_ERROR_M, pause=0.2),
+        Stroke(over, closed=False, free=True, speed=pick.lift_speed, error=pick.error),
+    ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any, Protocol
 
@@ -15,7 +15,8 @@ from robust_instant_policy.errors import RipError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.waypoints import plan_onward, plan_poses, plan_waypoints
-from robust_instant_policy.tasks.demonstrator import Stroke, perform
+from robust_instant_policy.tasks.demonstrator import Stroke, perform, shorter_turns
+from robust_instant_policy.tasks.level import PAPER, Layout, Level
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image, bounded_seed
 from robust_instant_policy.trajectory import Trajectory
@@ -49,8 +50,10 @@ class Cell(Protocol):
 
     ``advance`` takes one control step towards ``command (A·(J + 1),)``: for each arm the joint angles and the finger
     travel, rad and m. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is
-    not done, empty if it is done.
+    not done, empty if it is done. ``layout`` has the draws of the scene.
     """
+
+    layout: Layout
 
     def reset(self, *, seed: int) -> Any: ...
     def photograph(self) -> Observation: ...
@@ -81,21 +84,30 @@ class SimulatedTask:
     ``arms`` are the working arms, with equal grippers, in the order of the commands of ``cell``.
     """
 
-    def __init__(self, spec: TaskSpec, cell: Cell, arms: Sequence[Arm], timing: Timing, workspace: FloatArray):
+    def __init__(
+        self,
+        spec: TaskSpec,
+        cell: Cell,
+        arms: Sequence[Arm],
+        timing: Timing,
+        workspace: FloatArray,
+        level: Level = PAPER,
+    ):
         self.name, self.description, self.goal = spec.name, spec.description, spec.goal
         self.end_effectors = tuple(arm.name for arm in arms)
         self.record_hz = timing.control_hz / timing.record_every
         self.execute_hz = timing.execute_hz
         self.video_hz = timing.control_hz / timing.frame_every
         self.workspace = workspace
-        self._spec, self._cell, self._arms, self._timing = spec, cell, arms, timing
+        self._spec, self._cell, self._timing, self._level = spec, cell, timing, level
+        self._usual_arms = self._arms = arms  # with the usual start pose, and with that of the scene
         self._triangle = arms[0].triangle
         self._seed: int | None = None
         self._fresh = False  # no motion since the scene was built
 
     def reset(self, seed: int) -> Observation:
         self._rebuild(seed)
-        return self._cell.photograph()
+        return self._photograph()
 
     def execute(self, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
         if self._seed is None:
@@ -118,7 +130,7 @@ class SimulatedTask:
         motion = Motion.at_home(self._arms)
         steps, worst, failure = 0, 0.0, ""
         while steps < max_seconds * control_hz and not failure:
-            waypoints = controller.act(self._cell.photograph().rgb, self._action(motion.closed[-1]))
+            waypoints = controller.act(self._photograph().rgb, self._action(motion.closed[-1]))
             if waypoints is None:
                 break
             try:
@@ -137,6 +149,8 @@ class SimulatedTask:
         rng = np.random.default_rng([seed, HAND_STREAM])
         strokes = self._spec.expert(self._cell, rng)
         home = np.stack([arm.home_pose for arm in self._arms])
+        if self._level.turn:
+            strokes = shorter_turns(home, strokes)
         poses, closed = perform(home, strokes, rng, self._timing.control_hz)
         images: list[Image] = []
         try:
@@ -162,7 +176,17 @@ class SimulatedTask:
 
     def _rebuild(self, seed: int) -> None:
         self._cell.reset(seed=bounded_seed(seed, SEED_BITS))
-        self._seed, self._fresh = seed, True
+        self._seed, self._fresh, self._images = seed, True, 0
+        home = self._cell.layout.home(np.stack([arm.home for arm in self._usual_arms]))
+        self._arms = [replace(arm, home=joints) for arm, joints in zip(self._usual_arms, home, strict=True)]
+
+    def _photograph(self) -> Observation:
+        """The camera's image, with the noise of the level."""
+        seen, self._images = self._cell.photograph(), self._images + 1
+        if self._level.camera is None:
+            return seen
+        seed = np.random.SeedSequence([self._seed or 0, self._images]).generate_state(1)[0]
+        return self._level.camera.photograph(seen, int(seed))
 
     def _recorded(self, poses: FloatArray, every: int) -> range:
         """Indices of the recorded control steps; they include the last one, at which success is judged."""
@@ -201,7 +225,7 @@ class SimulatedTask:
 
         def before_step() -> None:
             if next(step) in steps:
-                images.append(self._cell.photograph().rgb)
+                images.append(self._photograph().rgb)
 
         return before_step
 

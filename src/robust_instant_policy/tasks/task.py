@@ -15,11 +15,13 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.trajectory import Trajectory
 
+SEED_BITS = 62  # of seeds, and of those counted up from them, which stand in tables of 64-bit integers
+
 Image = NDArray[np.uint8]
 FrameSink = Callable[[Image], None]
 
 
-def bounded_seed(seed: int, bits: int) -> int:
+def bounded_seed(seed: int, bits: int = SEED_BITS) -> int:
     """``seed`` if it fits into ``bits`` bits, else a number of ``bits`` bits, up to 64, derived from it."""
     if seed < 1 << bits:
         return seed

@@ -19,6 +19,7 @@ from robust_instant_policy.tasks.aloha.renderer import require_renderer
 from robust_instant_policy.tasks.aloha.robot import (
     ARM_JOINTS,
     ARMS,
+    BASE_X_M,
     CLOSED_M,
     FINGER_TRAVEL_M,
     FINGERS,
@@ -28,9 +29,20 @@ from robust_instant_policy.tasks.aloha.robot import (
     site_pose,
     two_arms,
 )
-from robust_instant_policy.tasks.aloha.surfaces import SOLID_GROUP, add_surface, box_surface
+from robust_instant_policy.tasks.aloha.surfaces import (
+    SOLID_GROUP,
+    add_solid,
+    add_surface,
+    box_surface,
+    fixed_body,
+    free_body,
+    paint,
+    revolved,
+    tube,
+)
+from robust_instant_policy.tasks.level import PAPER, Distractor, Layout, Level, Region, Rod, Surroundings
 from robust_instant_policy.tasks.scene_truth import SceneTruth
-from robust_instant_policy.tasks.textures import laminate
+from robust_instant_policy.tasks.textures import laminate, wood
 
 CONTROL_HZ = 50.0  # ALOHA's own
 TIMESTEP_S = 0.002
@@ -53,6 +65,9 @@ STILL_M_S = 0.02  # and an object
 HELD_N = 0.5  # force of each finger from which something is held
 
 WORKSPACE = np.array([[-0.30, -0.32, -0.005], [0.22, 0.32, 0.4]])
+REGION = Region((-BASE_X_M, 0.0), nearest=0.22, farthest=0.56, view=((-0.28, -0.28), (0.18, 0.28)))
+LAMPS = (((-0.15, 0.6, -1.0), 0.55, True), ((-0.3, -0.5, -1.0), 0.25, False))  # direction, intensity, shadow
+DISTRACTOR_DENSITY = 600.0  # kg/m³, wood
 
 
 class AlohaEnv(gymnasium.Env):
@@ -62,16 +77,22 @@ class AlohaEnv(gymnasium.Env):
     videos. Actions are, for each arm, the six joint angles (rad) and the travel of each finger
     (m, 0 closed), at `CONTROL_HZ`. Observations are the same quantities as measured, ``joints``, and with
     ``obs_mode="rgbd"`` the camera's ``rgb`` and ``depth`` (metres). The reward is 1 if the task is done.
-    ``objects`` as in `tasks.make_task`.
+    ``objects`` and ``level`` as in `tasks.make_task`.
     """
 
     end_effectors: ClassVar[tuple[str, ...]] = ("left",)
     beside: ClassVar[tuple[tuple[float, float, float], ...]] = ((-0.10, -0.80, 0.50), (-0.18, 0.0, 0.12))
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": int(CONTROL_HZ)}
 
-    def __init__(self, objects: str = "seen", obs_mode: str = "rgbd", render_mode: str | None = None):
+    def __init__(
+        self,
+        objects: str = "seen",
+        obs_mode: str = "rgbd",
+        render_mode: str | None = None,
+        level: Level = PAPER,
+    ):
         require_renderer()
-        self.objects, self.obs_mode, self.render_mode = objects, obs_mode, render_mode
+        self.objects, self.obs_mode, self.render_mode, self.level = objects, obs_mode, render_mode, level
         travel = [0.0], [FINGER_TRAVEL_M]
         ranges = _joint_ranges()
         bounds = (np.concatenate([ranges[:, i], travel[i]]).astype(np.float32) for i in (0, 1))
@@ -88,7 +109,7 @@ class AlohaEnv(gymnasium.Env):
         self._seed = 0
 
     def build(self, spec: mujoco.MjSpec) -> None:
-        """Add the episode's objects, drawn from `draw`, to ``spec``."""
+        """Add the episode's objects, drawn from `draw` and placed by `Layout.place`, to ``spec``."""
         raise NotImplementedError
 
     def failure(self) -> str:
@@ -103,15 +124,24 @@ class AlohaEnv(gymnasium.Env):
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
         self._close_renderers()
+        self.layout = Layout(self.level, self._seed, REGION)
         spec = two_arms()
-        _furnish(spec)
+        _furnish(spec, self.layout.surroundings())
         add_side_camera(spec.worldbody, *self.beside)
         self.build(spec)
+        for index, distractor in enumerate(self.layout.distractors()):
+            _add_distractor(spec, distractor, f"distractor-{index}")
+        rod = self.layout.rod((CAMERA_X_M, 0.0, CAMERA_HEIGHT_M))
+        if rod is not None:
+            _add_rod(spec, rod)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
+        home = dict(
+            zip(self.end_effectors, self.layout.home(np.array([HOME_JOINTS] * len(self.end_effectors))), strict=True)
+        )
         for side, arm in ARMS.items():
             works = side in self.end_effectors
-            joints, travel = (HOME_JOINTS, FINGER_TRAVEL_M) if works else (PARKED_JOINTS, 0.0)
+            joints, travel = (home[side], FINGER_TRAVEL_M) if works else (PARKED_JOINTS, 0.0)
             for joint, angle in zip(ARM_JOINTS, joints, strict=True):
                 self.data.joint(f"{arm}/{joint}").qpos = angle
                 self.data.actuator(f"{arm}/{joint}").ctrl = angle
@@ -244,8 +274,8 @@ def _joint_ranges() -> FloatArray:
     return np.array([model.joint(f"{ARMS['left']}/{joint}").range for joint in ARM_JOINTS])
 
 
-def _furnish(spec: mujoco.MjSpec) -> None:
-    """Physics, table, light and cameras."""
+def _furnish(spec: mujoco.MjSpec, surroundings: Surroundings | None) -> None:
+    """Physics, table, light and cameras; None for the usual surroundings."""
     option = spec.option
     option.timestep, option.integrator = TIMESTEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone, option.noslip_iterations, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 3, 10.0
@@ -276,19 +306,44 @@ def _furnish(spec: mujoco.MjSpec) -> None:
         height=384,
     )
     top = world.add_body(name="table-top", pos=[0, 0, -TABLE_SIZE_M[2] / 2])
-    add_surface(spec, top, "table-top", box_surface(TABLE_SIZE_M), laminate(np.random.default_rng(0)), shine=0.05)
-    for direction, diffuse, shadow in (((-0.15, 0.6, -1.0), 0.55, True), ((-0.3, -0.5, -1.0), 0.25, False)):
+    material, brightness = laminate(np.random.default_rng(0)), np.ones(3)
+    if surroundings is not None:
+        grain, brightness = surroundings.grain, surroundings.brightness
+        material = wood(surroundings.table, np.random.default_rng(0)) if grain else paint(surroundings.table)
+    add_surface(spec, top, "table-top", box_surface(TABLE_SIZE_M), material, shine=0.05)
+    for direction, diffuse, shadow in LAMPS:
+        rotated = direction if surroundings is None else surroundings.direction(direction)
         world.add_light(
             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-            dir=direction,
-            pos=[-1.5 * part for part in direction],
-            diffuse=[diffuse] * 3,
+            dir=rotated,
+            pos=[-1.5 * part for part in rotated],
+            diffuse=diffuse * brightness,
             specular=[0.1] * 3,
-            ambient=[0.2] * 3,
+            ambient=0.2 * brightness,
             castshadow=shadow,
         )
     camera = world.add_camera(name="top", pos=[CAMERA_X_M, 0, CAMERA_HEIGHT_M], fovy=CAMERA_FOV_DEG)
     camera.quat = [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)]
+
+
+def _add_distractor(spec: mujoco.MjSpec, distractor: Distractor, name: str) -> None:
+    body = free_body(spec, name, distractor.pose)
+    width, height = distractor.width, distractor.height
+    half: tuple[float, ...]
+    if distractor.kind == "box":
+        kind, half, volume = mujoco.mjtGeom.mjGEOM_BOX, (width / 2, width / 2, height / 2), width**2 * height
+        surface = box_surface((width, width, height))
+    else:
+        kind, half, volume = mujoco.mjtGeom.mjGEOM_CYLINDER, (width / 2, height / 2), np.pi / 4 * width**2 * height
+        low, high = -height / 2, height / 2
+        surface = revolved([(0.0, low), (width / 2, low), (width / 2, high), (0.0, high)])
+    add_surface(spec, body, name, surface, paint(distractor.color))
+    add_solid(body, kind, half, mass=DISTRACTOR_DENSITY * volume)
+
+
+def _add_rod(spec: mujoco.MjSpec, rod: Rod) -> None:
+    points = np.linspace(rod.start, rod.stop, 3)
+    add_surface(spec, fixed_body(spec, "rod", np.eye(4)), "rod", tube(points, rod.radius), paint((0.08, 0.08, 0.09)))
 
 
 def add_side_camera(world: Any, eye: ArrayLike, target: ArrayLike) -> None:

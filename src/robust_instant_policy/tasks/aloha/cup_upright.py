@@ -14,6 +14,8 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.14, -0.02), (-0.13, 0.13)
 YAW_RANGE_RAD = np.deg2rad(30)
+TURN_RAD = np.deg2rad(30)  # more at the hard level: a cup that points to the arm cannot be lifted by its rotation
+BODY_M = ((-0.06, -0.05), (-0.06, 0.05), (0.16, -0.05), (0.16, 0.05))  # the cup, lying and standing
 
 UPRIGHT_RAD = np.deg2rad(8)
 
@@ -37,7 +39,9 @@ class CupUprightEnv(AlohaEnv):
         self.cup = Cup.draw(self.draw("shape"))
         rng = self.draw("pose")
         yaw = rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD)
-        self.cup.build(spec, "cup", facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), yaw) @ self.cup.lying())
+        pose = facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), yaw)
+        pose = self.layout.place(pose, [(0.0, 0.0), (FORWARD_M, 0.0)], BODY_M, TURN_RAD)
+        self.cup.build(spec, "cup", pose @ self.cup.lying())
 
     def failure(self) -> str:
         lean = float(np.arccos(np.clip(self.pose_of("cup")[2, 2], -1, 1)))

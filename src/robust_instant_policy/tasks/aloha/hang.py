@@ -14,6 +14,9 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 HANGER_X_RANGE_M, HANGER_Y_RANGE_M = (-0.21, -0.17), (-0.05, 0.05)
 HANGER_YAW_RAD = np.deg2rad(10)
+HANGER_TURN_RAD = np.deg2rad(15)  # more at the hard level: the neck is grasped along the arm
+HANGER_M = ((-0.05, -0.10), (-0.05, 0.10), (0.08, 0.0))
+STAND_M = ((-0.12, -0.10), (-0.12, 0.10), (0.08, -0.08), (0.08, 0.08))  # with the hanger before it
 STAND_X_RANGE_M, STAND_Y_RANGE_M = (0.08, 0.15), (-0.14, 0.14)
 STAND_YAW_RAD = np.deg2rad(12)  # deviation from facing the arm, to either side
 
@@ -41,10 +44,12 @@ class HangEnv(AlohaEnv):
         self.hanger, self.stand = Hanger.draw(self.draw("hanger")), Stand.draw(self.draw("stand"))
         rng = self.draw("pose")
         x, y = rng.uniform(*HANGER_X_RANGE_M), rng.uniform(*HANGER_Y_RANGE_M)
-        self.hanger.build(spec, "hanger", facing(x, y, rng.uniform(-HANGER_YAW_RAD, HANGER_YAW_RAD)))
+        pose = facing(x, y, rng.uniform(-HANGER_YAW_RAD, HANGER_YAW_RAD))
+        self.hanger.build(spec, "hanger", self.layout.place(pose, [(0.0, 0.0)], HANGER_M, HANGER_TURN_RAD))
         x, y = rng.uniform(*STAND_X_RANGE_M), rng.uniform(*STAND_Y_RANGE_M)
         yaw = bearing(np.array([x, y, 0.0])) + rng.uniform(-STAND_YAW_RAD, STAND_YAW_RAD)
-        self.stand.build(spec, "stand", facing(x, y, yaw))
+        stand = self.layout.place(facing(x, y, yaw), [(0.0, 0.0)], STAND_M, turn=0.0)  # the hook goes over one end
+        self.stand.build(spec, "stand", stand)
 
     def failure(self) -> str:
         if self.is_held("hanger"):

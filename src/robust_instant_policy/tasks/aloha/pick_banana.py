@@ -16,6 +16,7 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.22, 0.04), (-0.20, 0.20)
 YAW_RANGE_RAD = np.deg2rad(40)
+HALF_LENGTH_M = 0.09  # of the longest banana
 MASS_KG = 0.12
 SKIN_FRICTION = 0.8
 
@@ -33,6 +34,7 @@ class PickBananaEnv(AlohaEnv):
         self.shape = Banana.draw(self.draw("shape"))
         rng = self.draw("pose")
         pose = facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
+        pose = self.layout.place(pose, [(-HALF_LENGTH_M, 0.0), (HALF_LENGTH_M, 0.0)])
         pose[2, 3] = self.shape.radius
         body = free_body(spec, "banana", pose)
         vertices, faces, _, uvs = self.shape.mesh()

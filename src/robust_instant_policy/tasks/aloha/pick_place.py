@@ -15,6 +15,7 @@ from robust_instant_policy.tasks.poses import downward, facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.21, 0.0), (-0.20, 0.20)
+BODY_M = ((-0.07, 0.0), (0.07, 0.0), (0.0, -0.07), (0.0, 0.07))  # the largest bowl
 APART_M = 0.17  # at least, between the middles of bottle and bowl
 
 GRASP_SHARE = 0.55  # of the body's height: where the fingertips hold it
@@ -35,8 +36,9 @@ class PickPlaceEnv(AlohaEnv):
         self.bowl = Bowl.draw(self.draw("bowl"))
         rng = self.draw("pose")
         (x, y), (bowl_x, bowl_y) = apart(rng, X_RANGE_M, Y_RANGE_M, APART_M)
-        self.bowl.build(spec, "bowl", facing(bowl_x, bowl_y, 0.0))
-        self.bottle.build(spec, "bottle", facing(x, y, rng.uniform(-np.pi, np.pi)))
+        bottle = self.layout.place(facing(x, y, rng.uniform(-np.pi, np.pi)), [(0.0, 0.0)], BODY_M)
+        self.bowl.build(spec, "bowl", self.layout.place(facing(bowl_x, bowl_y, 0.0), [(0.0, 0.0)], BODY_M))
+        self.bottle.build(spec, "bottle", bottle)
 
     def failure(self) -> str:
         distance = float(np.linalg.norm((self.pose_of("bottle") - self.pose_of("bowl"))[:2, 3]))

@@ -21,6 +21,9 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 BRUSH_X_RANGE_M, BRUSH_Y_RANGE_M = (-0.24, -0.20), (0.17, 0.21)
 DUST_X_RANGE_M, DUST_Y_RANGE_M = (-0.16, -0.08), (-0.10, 0.07)
 PAN_X_RANGE_M, PAN_Y_RANGE_M = (0.00, 0.05), (-0.22, -0.16)  # of its lip
+SWEPT_M = ((-0.14, -0.06), (-0.14, 0.06), (0.22, -0.08), (0.22, 0.08))  # from the object on
+BRUSH_M = ((-0.05, -0.05), (-0.05, 0.05), (0.05, -0.05), (0.05, 0.05))
+PAN_M = ((-0.02, -0.07), (-0.02, 0.07), (0.20, 0.0))
 BRUSH_YAW_RANGE_RAD, PAN_YAW_RANGE_RAD = np.deg2rad((-8, 8)), np.deg2rad((-10, 10))
 
 TOUCHED_SECONDS = 0.3  # minimum contact of the held brush with the table
@@ -59,9 +62,13 @@ class SweepEnv(AlohaEnv):
         brush = facing(rng.uniform(*BRUSH_X_RANGE_M), rng.uniform(*BRUSH_Y_RANGE_M), rng.uniform(*BRUSH_YAW_RANGE_RAD))
         x, y = rng.uniform(*DUST_X_RANGE_M), rng.uniform(*DUST_Y_RANGE_M)
         pan = facing(rng.uniform(*PAN_X_RANGE_M), rng.uniform(*PAN_Y_RANGE_M), rng.uniform(*PAN_YAW_RANGE_RAD))
-        self.brush.build(spec, "brush", brush)
-        self.pan.build(spec, "dustpan", pan)
-        self.dust.build(spec, "dust", facing(x, y, rng.uniform(-np.pi, np.pi)))
+        dust = facing(x, y, rng.uniform(-np.pi, np.pi))
+        # Both arms work beside each other: the tools stay as they are, the object lies in any direction already.
+        self.layout.place(dust, [(0.0, 0.0)], turn=0.0)
+        self.layout.place(facing(x, y, 0.0), SWEPT_M, turn=0.0)
+        self.brush.build(spec, "brush", self.layout.place(brush, [(0.0, 0.0)], BRUSH_M, turn=0.0))
+        self.pan.build(spec, "dustpan", self.layout.place(pan, [(0.0, 0.0)], PAN_M, turn=0.0))
+        self.dust.build(spec, "dust", dust)
         self._touched = 0.0
 
     def advance(self, command: FloatArray) -> None:

@@ -7,6 +7,7 @@ import gymnasium
 import robust_instant_policy.tasks.aloha.envs  # noqa: F401  (registers them)
 from robust_instant_policy.tasks.aloha.cell import CONTROL_HZ, WORKSPACE, AlohaEnv
 from robust_instant_policy.tasks.aloha.robot import viperx
+from robust_instant_policy.tasks.level import Level
 from robust_instant_policy.tasks.simulated_task import SimulatedTask, TaskSpec, Timing
 
 # "recorded at 10 Hz, but will be 1 Hz during the test phase to ensure stability" (Oh et al. 2025, Sec. V-A.1)
@@ -14,9 +15,9 @@ TIMING = Timing(control_hz=CONTROL_HZ, record_every=5, frame_every=10, execute_h
 
 
 class CellTask(SimulatedTask):
-    """A task of one arm or both; ``objects`` as in `tasks.make_task`, with one source of ``assets``."""
+    """A task of one arm or both; ``objects`` and ``level`` as in `tasks.make_task`, with one source of ``assets``."""
 
-    def __init__(self, spec: TaskSpec, objects: str, assets: str):
-        env = gymnasium.make(spec.env_id, objects=objects, obs_mode="none")
+    def __init__(self, spec: TaskSpec, objects: str, assets: str, level: Level):
+        env = gymnasium.make(spec.env_id, objects=objects, obs_mode="none", level=level)
         cell: AlohaEnv = env.unwrapped
-        super().__init__(spec, cell, [viperx(side) for side in cell.end_effectors], TIMING, WORKSPACE)
+        super().__init__(spec, cell, [viperx(side) for side in cell.end_effectors], TIMING, WORKSPACE, level)

@@ -18,6 +18,9 @@ from mani_skill.utils.structs.types import SimConfig
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, make_pose
+from robust_instant_policy.tasks.level import PAPER, Distractor, Layout, Level, Region
+from robust_instant_policy.tasks.maniskill.carpentry import add_box, add_cylinder
+from robust_instant_policy.tasks.maniskill.paint import BLACK, Paint
 from robust_instant_policy.tasks.maniskill.robot import FINGER_TRAVEL_M, UR5eHandE
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 
@@ -35,10 +38,14 @@ VIDEO_WIDTH, VIDEO_HEIGHT = 480, 360
 STILL_RAD_S = 0.2  # joint speed below which an arm is at rest, as in ManiSkill's tasks
 
 WORKSPACE = np.array([[-0.34, -0.4, -0.005], [0.46, 0.4, 0.4]])
+REGION = Region(BASE_POSITION_M[:2], nearest=0.27, farthest=0.74, view=((-0.29, -0.35), (0.41, 0.35)))
+LAMPS = (([-0.45, 0.55, -1.0], [1.2, 1.2, 1.15]), ([0.5, -0.5, -1.0], [0.5, 0.5, 0.55]))  # direction, colour
+AMBIENT = 0.42
+MAT_M = 0.0005  # height of the cover that gives the table another colour
 
 
 class CellEnv(BaseEnv):
-    """Base of the five environments; a subclass adds its objects and its condition of success."""
+    """Base of the environments; a subclass adds its objects and its condition of success."""
 
     SUPPORTED_ROBOTS = ("ur5e_hande",)
     SUPPORTED_REWARD_MODES = ("sparse", "none")
@@ -51,10 +58,12 @@ class CellEnv(BaseEnv):
         render_backend: str = "cpu",
         objects: str = "seen",
         assets: str = "code",
+        level: Level = PAPER,
         **kwargs: Any,
     ):
-        """``objects`` and ``assets`` as in `tasks.make_task`; everything else as in ManiSkill's environments."""
-        self.objects, self.assets = objects, assets
+        """``objects``, ``assets`` and ``level`` as in `tasks.make_task`; everything else as in ManiSkill's
+        environments."""
+        self.objects, self.assets, self.level = objects, assets, level
         # A used physics scene orders its contacts differently from a new one, which changes results by millimetres.
         # With a new scene at every reset, the same seed gives the same episode.
         kwargs.setdefault("reconfiguration_freq", 1)
@@ -80,22 +89,59 @@ class CellEnv(BaseEnv):
         super()._load_agent(options, sapien.Pose(p=BASE_POSITION_M))
 
     def _load_scene(self, options: dict) -> None:
+        self.layout = Layout(self.level, int(self._episode_seed[0]), REGION)
         self.table_scene = TableSceneBuilder(env=self)
         self.table_scene.build()
+        surroundings = self.layout.surroundings()
+        if surroundings is not None:
+            builder = self.scene.create_actor_builder()
+            paint = Paint(surroundings.table, grain=surroundings.grain)
+            add_box(builder, (1.2, 1.6, MAT_M), (0.1, 0, MAT_M / 2), paint, collide=False)
+            builder.initial_pose = sapien.Pose()
+            builder.build_static(name="mat")
 
     def _load_lighting(self, options: dict) -> None:
         # Slanted, so that flat metal does not reflect a lamp into the camera. No shadows: on the CPU they would take
         # several times as long to render as the rest of the image.
-        self.scene.set_ambient_light([0.42, 0.42, 0.42])
-        self.scene.add_directional_light([-0.45, 0.55, -1.0], [1.2, 1.2, 1.15])
-        self.scene.add_directional_light([0.5, -0.5, -1.0], [0.5, 0.5, 0.55])
+        surroundings = self.layout.surroundings()
+        brightness = np.ones(3) if surroundings is None else surroundings.brightness
+        self.scene.set_ambient_light(list(AMBIENT * brightness))
+        for direction, color in LAMPS:
+            rotated = direction if surroundings is None else surroundings.direction(direction)
+            self.scene.add_directional_light(rotated, list(np.array(color) * brightness))
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.table_scene.initialize(env_idx)
-        home = np.array([*HOME_JOINTS, FINGER_TRAVEL_M, FINGER_TRAVEL_M], dtype=np.float32)
+        (joints,) = self.layout.home(np.array([HOME_JOINTS]))
+        home = np.array([*joints, FINGER_TRAVEL_M, FINGER_TRAVEL_M], dtype=np.float32)
         self.agent.reset(home)
         self.agent.robot.set_pose(sapien.Pose(p=BASE_POSITION_M))
         self._joints_before = self.agent.robot.get_qpos().clone()
+        self.place_objects()
+        for index, distractor in enumerate(self.layout.distractors()):
+            self._add_distractor(distractor, f"distractor-{index}")
+        rod = self.layout.rod(CAMERA_POSITION_M)
+        if rod is not None:
+            builder = self.scene.create_actor_builder()
+            length = float(np.linalg.norm(rod.stop - rod.start))
+            middle, along = (rod.start + rod.stop) / 2, rod.stop - rod.start
+            add_cylinder(builder, rod.radius, length, middle, along, BLACK, collide=False)
+            builder.initial_pose = sapien.Pose()
+            builder.build_static(name="rod")
+
+    def place_objects(self) -> None:
+        """Put the objects of the episode where they are, each by `Layout.place`."""
+        raise NotImplementedError
+
+    def _add_distractor(self, distractor: Distractor, name: str) -> None:
+        builder = self.scene.create_actor_builder()
+        paint, width, height = Paint(distractor.color), distractor.width, distractor.height
+        if distractor.kind == "box":
+            add_box(builder, (width, width, height), (0, 0, 0), paint)
+        else:
+            add_cylinder(builder, width / 2, height, (0, 0, 0), "z", paint)
+        builder.initial_pose = sapien.Pose(distractor.pose)
+        builder.build(name=name)
 
     def advance(self, command: FloatArray) -> None:
         """One control step, with joint angles and finger travel ``(7,)`` commanded, without evaluation.

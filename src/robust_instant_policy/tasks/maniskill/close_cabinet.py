@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from mani_skill.utils.registration import register_env
 
 from robust_instant_policy.geometry import FloatArray
@@ -18,6 +17,7 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (0.08, 0.16), (-0.12, 0.06)  # of the middle of the cabinet's front, hinge on the +y side
 YAW_RANGE_RAD = np.deg2rad(20)
+BODY_M = ((-0.20, -0.10), (-0.20, 0.10), (0.20, -0.11), (0.20, 0.11))  # the largest cabinet, its door open
 OPEN_RANGE_RAD = np.deg2rad((50.0, 80.0))  # opening angle of the door at the start
 
 CLOSED_RAD = np.deg2rad(5)  # opening angle below which the door is closed
@@ -48,14 +48,18 @@ class CloseCabinetEnv(CellEnv):
             shape = draw_object({"seen": Cabinet.draw_seen, "unseen": Cabinet.draw_unseen}, self.objects, rng)
             self.cabinet, self.door = shape.build(self.scene), shape.door_geometry
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        super()._initialize_episode(env_idx, options)
+    def place_objects(self) -> None:
         rng = self.draw("pose")
-        self.front_pose = facing(
+        pose = facing(
             rng.uniform(*X_RANGE_M),
             self.door.side * rng.uniform(*Y_RANGE_M),
             rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD),
         )
+        # The door's edge at right angles, the fingers before it, and the edge of the closed door.
+        edge, hinge = self.door.width * PUSH_SHARE, self.door.side * self.door.width / 2
+        before = hinge - self.door.side * -APPROACH_M
+        reach = [(-edge, before), (-edge, -hinge / 2), (0.0, hinge - self.door.side * edge)]
+        self.front_pose = self.layout.place(pose, reach, BODY_M)
         self.cabinet.place(self.front_pose, rng.uniform(*OPEN_RANGE_RAD))
 
     def failure(self) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from mani_skill.utils.registration import register_env
 
 from robust_instant_policy.geometry import FloatArray
@@ -17,6 +16,7 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (0.06, 0.14), (-0.13, 0.13)  # of the middle of the chest's front
 YAW_RANGE_RAD = np.deg2rad(20)
+BODY_M = ((0.0, -0.12), (0.0, 0.12), (0.20, -0.12), (0.20, 0.12))  # corners of the largest chest
 
 OPEN_SHARE = 0.9
 STILL_M_S, STILL_RAD_S = 0.1, 1.0  # as in ManiSkill's OpenCabinetDrawer
@@ -41,12 +41,11 @@ class OpenDrawerEnv(CellEnv):
             shape = Chest.draw(self.draw("shape"))
             self.chest, self.drawer = shape.build(self.scene), shape.drawer
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        super()._initialize_episode(env_idx, options)
+    def place_objects(self) -> None:
         rng = self.draw("pose")
-        self.front_pose = facing(
-            rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD)
-        )
+        pose = facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
+        out = self.drawer.handle[0] - self.drawer.travel
+        self.front_pose = self.layout.place(pose, [(out, 0.0), (0.0, 0.0)], BODY_M)
         self.chest.place(self.front_pose, 0.0)
 
     def failure(self) -> str:

@@ -9,7 +9,6 @@ import numpy as np
 import sapien
 import sapien.physx
 import sapien.render
-import torch
 from mani_skill.utils.building import actors
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs.actor import Actor
@@ -27,6 +26,7 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.08, 0.16), (-0.15, 0.15)
 YAW_RANGE_RAD = np.deg2rad(30)
+HALF_LENGTH_M = 0.09  # of the longest banana
 DENSITY = 650.0  # kg/m³: its capsules overlap
 SKIN_FRICTION = 0.8
 
@@ -60,10 +60,10 @@ class PickBananaEnv(CellEnv):
             self.banana = _build(shape, self.scene)
             self.lie, self.rest_height = np.eye(4), shape.radius
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        super()._initialize_episode(env_idx, options)
+    def place_objects(self) -> None:
         rng = self.draw("pose")
         pose = facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
+        pose = self.layout.place(pose, [(-HALF_LENGTH_M, 0.0), (HALF_LENGTH_M, 0.0)])
         pose[2, 3] = self.rest_height
         self.banana.set_pose(sapien.Pose(pose @ invert_pose(self.lie)))
 

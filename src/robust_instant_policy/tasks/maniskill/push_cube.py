@@ -7,20 +7,23 @@ import sapien
 import torch
 from mani_skill.utils.building import actors
 from mani_skill.utils.registration import register_env
+from scipy.spatial.transform import Rotation
 
+from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
-from robust_instant_policy.tasks.poses import downward
+from robust_instant_policy.tasks.poses import downward, facing
 from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 CUBE_HALF_SIZE_M = 0.02
 CUBE_RANGE_M = 0.1  # the cube's x and y lie within ± this
-CUBE_COLOR = (12 / 255, 42 / 255, 160 / 255, 1.0)
+CUBE_COLORS = {"seen": (12 / 255, 42 / 255, 160 / 255, 1.0), "unseen": (0.05, 0.35, 0.12, 1.0)}
 GOAL_RADIUS_M = 0.1
 GOAL_DISTANCE_M = 0.1 + GOAL_RADIUS_M  # from the cube, along +x
 HEIGHT_TOLERANCE_M = 5e-3
 
 FINGER_HALF_WIDTH_M = 0.011
+BEHIND_M = -CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M  # fingers that touch the cube, from its middle
 APPROACH_M = 0.05  # between fingers and cube while the gripper descends
 CLEARANCE_M = 0.1  # travel height of the gripper
 PUSH_HEIGHT_M = 0.015
@@ -29,14 +32,20 @@ OVERSHOOT_M = 0.02  # the demonstrator stops within ± this of the middle of the
 
 @register_env("RIP-PushCube-v1", max_episode_steps=600)
 class PushCubeEnv(CellEnv):
-    """Success: the cube's centre within the goal disc, the cube still on the table."""
+    """Success: the cube's centre within the goal disc, the cube still on the table.
+
+    ``push_pose (4, 4)`` is the frame on the table under the cube, x towards the goal, ``distance`` metres away.
+    """
+
+    push_pose: FloatArray
+    distance: float
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
         self.cube = actors.build_cube(
             self.scene,
             half_size=CUBE_HALF_SIZE_M,
-            color=np.array(CUBE_COLOR),
+            color=np.array(CUBE_COLORS[self.objects]),
             name="cube",
             initial_pose=sapien.Pose(p=[0, 0, CUBE_HALF_SIZE_M]),
         )
@@ -50,12 +59,17 @@ class PushCubeEnv(CellEnv):
             initial_pose=sapien.Pose(p=[GOAL_DISTANCE_M, 0, 1e-3]),
         )
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        super()._initialize_episode(env_idx, options)
-        x, y = self.draw("pose").uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2)
-        self.cube.set_pose(sapien.Pose([x, y, CUBE_HALF_SIZE_M]))
-        flat = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]  # the disc's axis is its x axis
-        self.goal.set_pose(sapien.Pose([x + GOAL_DISTANCE_M, y, 1e-3], flat))
+    def place_objects(self) -> None:
+        pose, self.distance, turn = self.draw_push(self.draw("pose"))
+        self.push_pose = self.layout.place(pose, [(BEHIND_M - APPROACH_M, 0.0), (self.distance, 0.0)])
+        cube = facing(0.0, 0.0, turn) @ make_pose(np.eye(3), (0.0, 0.0, CUBE_HALF_SIZE_M))
+        self.cube.set_pose(sapien.Pose(self.push_pose @ cube))
+        on_its_face = Rotation.from_euler("y", 90, degrees=True).as_matrix()  # the disc's axis is its x axis
+        self.goal.set_pose(sapien.Pose(self.push_pose @ make_pose(on_its_face, (self.distance, 0.0, 1e-3))))
+
+    def draw_push(self, rng: np.random.Generator) -> tuple[FloatArray, float, float]:
+        """The pose and the distance of the push, and how far the cube is turned in it, rad."""
+        return facing(*rng.uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2), 0.0), GOAL_DISTANCE_M, 0.0
 
     def failure(self) -> str:
         cube, goal = self.cube.pose.p[0], self.goal.pose.p[0]
@@ -69,15 +83,21 @@ class PushCubeEnv(CellEnv):
 
 
 def push(env: PushCubeEnv, rng: np.random.Generator) -> list[Stroke]:
-    """Close the gripper, descend behind the cube, push it along +x into the goal, and retreat."""
-    x, y, _ = env.cube.pose.p[0].tolist()
-    behind = x - CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M - APPROACH_M
-    end = x + GOAL_DISTANCE_M - CUBE_HALF_SIZE_M - FINGER_HALF_WIDTH_M + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
+    """Close the gripper, descend behind the cube, push it straight into the goal, and retreat."""
+    behind = BEHIND_M - APPROACH_M
+    end = BEHIND_M + env.distance + rng.uniform(-OVERSHOOT_M, OVERSHOOT_M)
+
+    cube = env.push_pose.copy()
+    cube[:2, 3] = env.cube.pose.p[0, :2].tolist()  # in the simulator's precision
+
+    def at(along: float, z: float) -> FloatArray:
+        return (cube @ downward(along, 0.0, z))[None]
+
     return [
-        Stroke(np.array([downward(behind, y, CLEARANCE_M)]), closed=True, free=True, speed=0.35, error=0.004),
-        Stroke(np.array([downward(behind, y, PUSH_HEIGHT_M)]), closed=True, speed=0.15),
-        Stroke(np.array([downward(end, y, PUSH_HEIGHT_M)]), closed=True, speed=0.18),
-        Stroke(np.array([downward(end - APPROACH_M, y, CLEARANCE_M)]), closed=True, free=True, error=0.006),
+        Stroke(at(behind, CLEARANCE_M), closed=True, free=True, speed=0.35, error=0.004),
+        Stroke(at(behind, PUSH_HEIGHT_M), closed=True, speed=0.15),
+        Stroke(at(end, PUSH_HEIGHT_M), closed=True, speed=0.18),
+        Stroke(at(end - APPROACH_M, CLEARANCE_M), closed=True, free=True, error=0.006),
     ]
 
 

@@ -1,4 +1,4 @@
-"""The five tasks of the ManiSkill cell as `tasks.task.Task`."""
+"""The tasks of the ManiSkill cell as `tasks.task.Task`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import gc
 
 import gymnasium
 
+from robust_instant_policy.tasks.level import Level
 from robust_instant_policy.tasks.maniskill.arm import EXECUTE_HZ, ur5e_hande
 from robust_instant_policy.tasks.maniskill.cell import RECORD_HZ, WORKSPACE
 from robust_instant_policy.tasks.maniskill.renderer import require_renderer
@@ -15,12 +16,14 @@ TIMING = Timing(control_hz=RECORD_HZ, record_every=1, frame_every=4, execute_hz=
 
 
 class CellTask(SimulatedTask):
-    """A task in the cell with the UR5e; ``objects`` and ``assets`` as in `tasks.make_task`."""
+    """A task in the cell with the UR5e; ``objects``, ``assets`` and ``level`` as in `tasks.make_task`."""
 
-    def __init__(self, spec: TaskSpec, objects: str, assets: str):
+    def __init__(self, spec: TaskSpec, objects: str, assets: str, level: Level):
         require_renderer()
-        env = gymnasium.make(spec.env_id, obs_mode="none", reward_mode="none", objects=objects, assets=assets)
-        super().__init__(spec, env.unwrapped, [ur5e_hande()], TIMING, WORKSPACE)
+        env = gymnasium.make(
+            spec.env_id, obs_mode="none", reward_mode="none", objects=objects, assets=assets, level=level
+        )
+        super().__init__(spec, env.unwrapped, [ur5e_hande()], TIMING, WORKSPACE, level)
         # The simulator runs the garbage collector whenever it rebuilds a scene. Excluding the objects that exist now
         # (torch and other libraries) makes a reset several times faster.
         gc.collect()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from mani_skill.utils.registration import register_env
 
 from robust_instant_policy.geometry import FloatArray
@@ -18,6 +17,7 @@ from robust_instant_policy.tasks.simulated_task import TaskSpec
 
 X_RANGE_M, Y_RANGE_M = (-0.02, 0.16), (-0.14, 0.10)
 YAW_RANGE_RAD = np.deg2rad(30)
+REACH_M = ((-0.06, 0.0), (0.0, 0.12), (0.12, 0.0), (0.0, -0.06))  # where the longest lever is pushed to and from
 
 TARGET_SHARE = 0.9  # of the lever's range, as in ManiSkill's TurnFaucet
 
@@ -46,12 +46,10 @@ class TurnFaucetEnv(CellEnv):
             shape = draw_object({"seen": Faucet.draw_seen, "unseen": Faucet.draw_unseen}, self.objects, rng)
             self.faucet, self.lever = shape.build(self.scene), shape.lever_geometry
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        super()._initialize_episode(env_idx, options)
+    def place_objects(self) -> None:
         rng = self.draw("pose")
-        self.foot_pose = facing(
-            rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD)
-        )
+        pose = facing(rng.uniform(*X_RANGE_M), rng.uniform(*Y_RANGE_M), rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
+        self.foot_pose = self.layout.place(pose, REACH_M, [(-0.13, 0.0)])
         self.faucet.place(self.foot_pose, 0.0)
 
     def failure(self) -> str:
