@@ -21,6 +21,7 @@ from robust_instant_policy.perception.objects import (
     RigidObject,
     find_objects,
     register_all,
+    segmentation,
     without,
 )
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
@@ -57,7 +58,8 @@ class KeypointExtractor:
     `perception.nearest`), which uses no workspace. Deterministic for a ``seed``.
 
     After `fit`: ``keypoints_ (I, K, 3)`` metres, world, and ``pixels_ (I, K, 2)`` (u, v) of I demonstrations;
-    ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``notes_`` for the user, one line each.
+    ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``object_of_ (K,)``, the number of each
+    keypoint's; ``segmentations_``, see `segmentation`; ``notes_`` for the user, one line each.
     """
 
     def __init__(
@@ -127,13 +129,19 @@ class KeypointExtractor:
         found = [self._locate(view, [t.registrations[i] for t in self.objects_]) for i, view in enumerate(views)]
         self.keypoints_ = np.stack([located.keypoints for located in found])
         self.pixels_ = np.stack([located.pixels for located in found])
+        self.object_of_ = np.repeat(np.arange(len(counts)), counts)
+        models = [thing.model for thing in self.objects_]
+        self.segmentations_ = tuple(
+            segmentation(models, [thing.registrations[i] for thing in self.objects_], view)
+            for i, view in enumerate(views)
+        )
         self.notes_ = tuple(notes)
         return self
 
     def _fit_nearest(self, observations: Sequence[Observation], note: str) -> KeypointExtractor:
         images = [Image.of(observation, self.network_) for observation in observations]
         self._shared, notes = share_descriptors(images, self.num_keypoints, self.seed)
-        self.objects_ = []
+        self.objects_, self.segmentations_, self.object_of_ = [], (), np.full(self.num_keypoints, -1)
         self.notes_ = (note, *notes)
         found = [
             (image.points(cells), image.pixels(cells)) for image, cells in zip(images, self._shared.cells, strict=True)
@@ -169,7 +177,7 @@ class KeypointExtractor:
         for k in np.flatnonzero(~measured):
             notes.append(f"keypoint {k} has no depth at its pixel; it is where its object says")
         for number, found in enumerate(registrations):
-            if found.fitness < MIN_FITNESS:
+            if found.fitness < MIN_FITNESS and counts[number]:
                 notes.append(f"object {number} was hardly recognised (fit {found.fitness:.2f})")
         return Located(transform_points(view.to_world, points), pixels, np.clip(confidence, 0, 1), tuple(notes))
 

@@ -22,7 +22,7 @@ from robust_instant_policy.perception.registration import (
     settle_turn,
     vote_for_motions,
 )
-from robust_instant_policy.perception.view import MIN_FOREGROUND_POINTS, View, subsample
+from robust_instant_policy.perception.view import MIN_FOREGROUND_POINTS, UNRELATED, View, subsample
 
 MAX_TEMPLATE_POINTS = 250
 MAX_TEMPLATE_CELLS = 80
@@ -212,13 +212,27 @@ def _shapes(models: Sequence[Model], found: Sequence[Registration], view: View) 
     if not models:
         return []
     points = view.target[:, :3].astype(np.float64)
-    moved = [transform_points(one.pose, model.points) for model, one in zip(models, found, strict=True)]
-    distances = np.array([cKDTree(one).query(points)[0] for one in moved])
-    owner = np.where(distances.min(axis=0) < SHAPE_REACH_M, distances.argmin(axis=0), -1)
+    owner = _owners(models, [one.pose for one in found], points)
     return [
         fit_shape(one.pose, model.points, points[owner == i])
         for i, (model, one) in enumerate(zip(models, found, strict=True))
     ]
+
+
+def _owners(models: Sequence[Model], motions: Sequence[FloatArray], points: FloatArray) -> IntArray:
+    """Number ``(N,)`` of the nearest object, at its motion, to each of ``points (N, 3)``; -1 where none is near."""
+    moved = [transform_points(motion, model.points) for model, motion in zip(models, motions, strict=True)]
+    distances = np.array([cKDTree(one).query(points)[0] for one in moved])
+    return np.where(distances.min(axis=0) < SHAPE_REACH_M, distances.argmin(axis=0), -1)
+
+
+def segmentation(models: Sequence[Model], found: Sequence[Registration], view: View) -> NDArray[np.int16]:
+    """``(H, W)``: the number of the object at each pixel of ``view``, or the key in `REASONS` of why there is none."""
+    labels = view.labels.copy()
+    owner = _owners(models, [one.motion for one in found], view.points)
+    labels[labels >= 0] = np.where(owner >= 0, owner, UNRELATED)
+    height, width = view.depth.shape
+    return labels.repeat(view.stride, axis=0).repeat(view.stride, axis=1)[:height, :width]
 
 
 def without(things: Sequence[RigidObject], dropped: Sequence[bool]) -> list[RigidObject]:
@@ -345,7 +359,7 @@ def _shared(tree: cKDTree, taken: NDArray[np.bool_], model: Model, found: Regist
 
 def _another_template(view: View, found: Registration, templates: Sequence[Template], seed: int) -> list[Template]:
     """The object as ``view`` shows it, or nothing where it does not."""
-    to_reference: FloatArray = np.linalg.inv(found.motion)
+    to_reference = np.asarray(np.linalg.inv(found.motion), dtype=np.float64)
     known = templates[found.template].xyzrgb
     points = transform_points(to_reference, view.target[:, :3])
     same = cKDTree(known[:, :3]).query(points)[0] < SAME_OBJECT_M

@@ -49,7 +49,7 @@ BORDER_SHARE = 0.01  # of the image's width and height, at its border
 HOVERING_M = 0.06  # above the table where it crosses the image's border: an arm or a person
 TALLEST_M = 0.8  # of what stands on a table
 
-TABLE, BELOW, BESIDE, HIGH, BORDER, SMALL, OUTSIDE, UNKNOWN = -1, -2, -3, -4, -5, -6, -7, -8
+TABLE, BELOW, BESIDE, HIGH, BORDER, SMALL, OUTSIDE, UNKNOWN, UNRELATED = -1, -2, -3, -4, -5, -6, -7, -8, -9
 REASONS = {
     TABLE: "table",
     BELOW: "below the table",
@@ -59,6 +59,7 @@ REASONS = {
     SMALL: "too small",
     OUTSIDE: "outside the workspace",
     UNKNOWN: "no steady depth",
+    UNRELATED: "no object that all demonstrations show",
 }
 
 
