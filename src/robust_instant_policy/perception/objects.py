@@ -32,6 +32,7 @@ CLAIM_M = 0.012  # from a registered object's points: image points that it expla
 RIVAL_SCALE = 0.01  # of the score by which a motion is worse, for a weight of 1/e
 SAME_PLACE_M = 0.02
 MIN_FITNESS = 0.15  # of an object's registration in every demonstration
+MIN_PART_FITNESS = 0.5  # median, of a part: things of one kind in other colours have 0.3, in the same 0.7
 MAX_OBJECTS = 30
 SHAPE_REACH_M = 0.03  # from an object: greatest distance of points of a larger one of its kind
 SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
@@ -266,7 +267,8 @@ def _split(
             rest = register(rest_model.templates, view, near=whole.pose)
             taken = _explained([rest_model], [rest], [0])
             pairs.append((rest, register(part_model.templates, view, taken, rest.pose, PART_TURNS)))
-        if min(own.fitness for _, own in pairs) < MIN_FITNESS:
+        fitness = [own.fitness for _, own in pairs]
+        if min(fitness) < MIN_FITNESS or np.median(fitness) < MIN_PART_FITNESS:
             continue
         gained = gain(home.points[piece[part]], views, motions, [own.pose for _, own in pairs])
         if gained > best:
