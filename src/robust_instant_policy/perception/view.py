@@ -260,11 +260,11 @@ def _leave_out(label: IntArray, heights: FloatArray, pixels: IntArray) -> str:
     number, small = 0, []
     for piece in np.unique(label[label >= 0]):
         members = np.flatnonzero(label == piece)
+        if MIN_TOLD_POINTS <= len(members) < MIN_FOREGROUND_POINTS and heights[members].min() > 0:
+            small.append("({:.0f}, {:.0f})".format(*pixels[members].mean(axis=0)))
         crossing = heights[members][at_border[members]]
         if len(members) < MIN_PIECE_POINTS:
             label[members] = SMALL
-            if len(members) >= MIN_TOLD_POINTS and heights[members].min() > 0:
-                small.append("({:.0f}, {:.0f})".format(*pixels[members].mean(axis=0)))
         elif len(crossing) and crossing.min() > HOVERING_M:
             label[members] = BORDER
         else:
