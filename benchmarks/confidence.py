@@ -36,7 +36,7 @@ from stand_in import StandIn
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import KeypointError, PlanningError, RipError
+from robust_instant_policy.errors import InvalidValueError, KeypointError, PlanningError, RipError
 from robust_instant_policy.evaluation.statistics import wilson_interval
 from robust_instant_policy.policies import RobustInstantPolicy
 from robust_instant_policy.policies.confidence import COEFFICIENTS, GOOD_AGREEMENT, Evidence, plan_confidence
@@ -53,7 +53,7 @@ NUM_DEMOS = 10
 GATE = 0.9
 PRIOR_WEIGHT = 0.5  # of a coefficient's squared distance from 1, in units of the log-likelihood
 NAMES = [field.name for field in fields(Evidence)]
-REFUSALS = (KeypointError, PlanningError)
+REFUSALS = (InvalidValueError, KeypointError, PlanningError)
 Row = dict[str, Any]
 Coefficients = Mapping[str, float]
 
