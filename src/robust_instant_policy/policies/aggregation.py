@@ -94,6 +94,7 @@ def make_plan(
     findings = (*context.report.findings, *scene.findings, *outside)
     evidence = Evidence(
         agreement=chosen.confidence,
+        vote=context.prompt.vote(scene.keypoints),
         distortion=distortion(context.keypoints, scene.keypoints),
         prediction=prediction(context.prediction_errors),
         novelty=novelty(context.keypoints, scene.keypoints),
