@@ -34,6 +34,7 @@ from perception_real import real
 from PIL import Image, ImageDraw
 
 from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception import (
     CORRESPONDENCES,
@@ -50,7 +51,7 @@ from robust_instant_policy.perception.settings import DescriptorSettings
 from robust_instant_policy.perception.view import make_view
 from robust_instant_policy.perception.vit import VitDescriptors
 from robust_instant_policy.perception.vit_checkpoint import load_checkpoint
-from robust_instant_policy.tasks import TASK_NAMES, make_task
+from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 
@@ -276,7 +277,7 @@ def write_speed() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("accuracy").add_argument("--tasks", nargs="*", default=list(TASK_NAMES))
+    commands.add_parser("accuracy").add_argument("--tasks", nargs="*", default=list(SIMULATION_TASKS))
     commands.add_parser("picture").add_argument("--task", default="open-drawer")
     photographs = commands.add_parser("real")
     photographs.add_argument("folder", type=Path)
