@@ -19,11 +19,12 @@ import argparse
 import json
 import sys
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 from unittest.mock import patch
 
@@ -35,7 +36,7 @@ from stand_in import StandIn
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import KeypointError, PlanningError, RipError
+from robust_instant_policy.errors import InvalidValueError, KeypointError, PlanningError, RipError
 from robust_instant_policy.evaluation.statistics import wilson_interval
 from robust_instant_policy.policies import RobustInstantPolicy
 from robust_instant_policy.policies.confidence import COEFFICIENTS, GOOD_AGREEMENT, Evidence, plan_confidence
@@ -52,8 +53,9 @@ NUM_DEMOS = 10
 GATE = 0.9
 PRIOR_WEIGHT = 0.5  # of a coefficient's squared distance from 1, in units of the log-likelihood
 NAMES = [field.name for field in fields(Evidence)]
-REFUSALS = (KeypointError, PlanningError)
+REFUSALS = (InvalidValueError, KeypointError, PlanningError)
 Row = dict[str, Any]
+Coefficients = Mapping[str, float]
 
 
 def demonstrations(folder: Path, task: Any, first_seed: int) -> list[Demonstration]:
@@ -192,10 +194,10 @@ def evidence_of(row: Row) -> Evidence:
     return Evidence(**{name: row["evidence"].get(name, np.nan) for name in NAMES})
 
 
-def confidence_of(row: Row) -> float:
-    """By the coefficients as they are now; 0 where it was refused, or a fault applied to the plan was noticed."""
+def confidence_of(row: Row, coefficients: Coefficients = COEFFICIENTS) -> float:
+    """By ``coefficients``; 0 where it was refused, or a fault applied to the plan was noticed."""
     noticed = row["fault"].endswith(":plan") and row["confidence"] == 0
-    return 0.0 if row["refused"] or noticed else plan_confidence(evidence_of(row))
+    return 0.0 if row["refused"] or noticed else plan_confidence(evidence_of(row), coefficients)
 
 
 def fit(options: argparse.Namespace) -> None:
@@ -211,27 +213,21 @@ def fit(options: argparse.Namespace) -> None:
     right = np.array([row["outcome"] == "success" for row in rows])
     tasks = np.array([row["task"] for row in rows])
 
-    def solve(chosen: np.ndarray) -> np.ndarray:
+    def solve(chosen: np.ndarray) -> dict[str, float]:
         def loss(b: np.ndarray) -> float:
             score = features[chosen] @ b
             likelihood = -np.logaddexp(0, np.where(right[chosen], -score, score)).sum()
             return float(PRIOR_WEIGHT * ((b[1:] - 1) ** 2).sum() - likelihood)
 
         bounds = [(None, None)] + [(0, None)] * len(names)
-        return minimize(loss, np.ones(len(names) + 1), bounds=bounds).x
+        best = minimize(loss, np.ones(len(names) + 1), bounds=bounds).x
+        return {name: round(float(b), 2) for name, b in zip(["constant", *names], best, strict=True)}
 
-    best = solve(np.ones(len(rows), dtype=bool))
     print(f"{len(rows)} plans, {right.mean():.1%} right")
-    print("COEFFICIENTS =", {name: round(float(b), 2) for name, b in zip(["constant", *names], best, strict=True)})
-    for task in sorted(set(tasks)):
-        left = tasks == task
-        b = solve(~left)
-        p = 1 / (1 + np.exp(-features[left] @ b))
-        passed = p >= GATE
-        print(
-            f"  without {task:<20} right {right[left].mean():.2f}, mean confidence {p.mean():.2f}, "
-            f"passing {passed.mean():.2f}, of these right {right[left][passed].mean() if passed.any() else np.nan:.2f}"
-        )
+    print("COEFFICIENTS =", solve(np.ones(len(rows), dtype=bool)))
+    without = {task: solve(tasks != task) for task in sorted(set(tasks))}
+    print("each task with the coefficients that the others give:")
+    print(table({"all": all_rows(options.folder, "tune")}, without))
 
 
 def auroc(confidence: np.ndarray, right: np.ndarray) -> float:
@@ -240,9 +236,9 @@ def auroc(confidence: np.ndarray, right: np.ndarray) -> float:
     return float(((good > bad) + 0.5 * (good == bad)).mean()) if good.size and bad.size else float("nan")
 
 
-def summary(rows: Sequence[Row]) -> dict[str, str]:
+def summary(rows: Sequence[Row], of_tasks: Mapping[str, Coefficients]) -> dict[str, str]:
     made = executed(rows)
-    confidence, right = judged(made)
+    confidence, right = judged(made, of_tasks)
     passed = confidence >= GATE
     wrong, through = int((passed & ~right).sum()), int(passed.sum())
     low, high = wilson_interval(wrong, through)
@@ -253,13 +249,23 @@ def summary(rows: Sequence[Row]) -> dict[str, str]:
         "right ones that pass": f"{passed[right].mean():.0%}" if right.any() else "–",
         "wrong among those that pass": f"{wrong} of {through}: {wrong / max(through, 1):.1%} ({low:.1%} to {high:.1%})",
         "AUROC": f"{auroc(confidence, right):.3f}",
-        "with refusals": f"{auroc(*judged(rows)):.3f}",
+        "with refusals": f"{auroc(*judged(rows, of_tasks)):.3f}",
     }
 
 
-def judged(rows: Sequence[Row]) -> tuple[np.ndarray, np.ndarray]:
+def table(parts: Mapping[str, Sequence[Row]], of_tasks: Mapping[str, Coefficients] = MappingProxyType({})) -> str:
+    """Markdown: the `summary` of each part; ``of_tasks`` are coefficients for single tasks."""
+    lines = {name: summary(rows, of_tasks) for name, rows in parts.items() if rows}
+    columns = list(next(iter(lines.values())))
+    head = ["| | " + " | ".join(columns) + " |", "| --- " * (len(columns) + 1) + "|"]
+    return "\n".join(head + [f"| {name} | " + " | ".join(line.values()) + " |" for name, line in lines.items()])
+
+
+def judged(
+    rows: Sequence[Row], of_tasks: Mapping[str, Coefficients] = MappingProxyType({})
+) -> tuple[np.ndarray, np.ndarray]:
     """Confidence of each row, and whether its plan is right; a refused one's is the plan made without checks."""
-    confidence = np.array([confidence_of(row) for row in rows])
+    confidence = np.array([confidence_of(row, of_tasks.get(row["task"], COEFFICIENTS)) for row in rows])
     return confidence, np.array([row["outcome"] == "success" for row in rows], dtype=bool)
 
 
@@ -273,10 +279,7 @@ def report(options: argparse.Namespace) -> None:
         "all": rows,
     }
     parts |= {f"all, {task}": [row for row in rows if row["task"] == task] for task in TASK_NAMES}
-    columns = list(summary(rows))
-    lines = ["| | " + " | ".join(columns) + " |", "| --- " * (len(columns) + 1) + "|"]
-    lines += [f"| {name} | " + " | ".join(summary(part).values()) + " |" for name, part in parts.items() if part]
-    text = "\n".join(lines)
+    text = table(parts)
     print(text)
     print("\nwrong plans that pass:")
     for row in executed(rows):

@@ -184,7 +184,7 @@ class Set:
             context, fit_s = self.context(Settings())
             assert isinstance(context.prompt, FactorisedPrompt)
             start = time.perf_counter()
-            trajectory = context.prompt.median_trajectory(scene.keypoints)
+            trajectory = context.prompt.for_scene(scene.keypoints).median_trajectory(scene.keypoints)
             yield "median", judged([trajectory], truth, fit_s=fit_s, plan_s=time.perf_counter() - start)
             return
         policies = {"neighbours": Neighbours, "gp": KeypointRegression, "gp-world": KeypointRegression}
@@ -331,11 +331,13 @@ def table(rows: Sequence[Row]) -> str:
         head = ["", title, "", "| family | " + " | ".join(heads) + " |", "| --- " * (len(heads) + 1) + "|"]
         return head + [f"| {name} | " + " | ".join(cells(name)) + " |" for name in families]
 
-    noise, demos = STANDARD
+    measured = {(row.case.noise_mm, row.case.demos) for row in rows}
+    standard = STANDARD if STANDARD in measured or not measured else min(measured)
+    noise, demos = standard
     text = lines(
         f"{demos} demonstrations, {noise:g} mm of noise: right, median error at key steps and along the way (mm).",
         [f"{method} {model}".strip() for method, model in columns],
-        lambda name: [cell(by_case[name, *column, *STANDARD]) for column in columns],
+        lambda name: [cell(by_case.get((name, *column, *standard), [])) for column in columns],
     )
     for column in columns:
         others = sorted({key[3:] for key in by_case if key[1:3] == column})
@@ -343,7 +345,9 @@ def table(rows: Sequence[Row]) -> str:
             text += lines(
                 f"`{' '.join(column).strip()}`: right, by demonstrations and keypoint noise.",
                 [f"{demos}, {noise:g} mm" for noise, demos in others],
-                lambda name, column=column, others=others: [share(by_case[name, *column, *one]) for one in others],
+                lambda name, column=column, others=others: [
+                    share(by_case.get((name, *column, *one), [])) for one in others
+                ],
             )
     return "\n".join(text).strip() + "\n"
 

@@ -9,7 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-from relation_families import FAMILIES
+from relation_families import FAMILIES, UNCOVERED
 from relations import WITHIN_M, key_error, read_rows, way_error
 
 from robust_instant_policy.errors import UsageError
@@ -61,6 +61,22 @@ def test_a_plan_needs_keypoints_only():
         locate(context, None)
 
 
+def test_a_scene_between_two_ways_to_act_has_less_confidence_and_says_so():
+    family = FAMILIES["side"]
+    draw = family.scenes("tune", 0, 0.002)
+    shown = [draw(number) for number in range(10)]
+    context = context_of_keypoints(
+        np.stack([scene.keypoints for scene in shown]), [scene.path for scene in shown], Settings()
+    )
+    policy = Neighbours().fit_context(context)
+    keypoints = next(scene.keypoints for scene in shown if abs(scene.keypoints[:5, 1].mean()) > 0.05)
+    middle = keypoints - np.array([0.0, 1.0, 0.0]) * keypoints[:5, 1].mean() * (np.arange(10) < 5)[:, None]
+    clear, close = (policy.plan_scene(scene_of_keypoints(points)) for points in (keypoints, middle))
+    assert close.evidence["vote"] < clear.evidence["vote"]
+    assert close.confidence < clear.confidence
+    assert any("do different things" in note for note in close.notes)
+
+
 def test_the_benchmark_writes_rows_once_and_a_table(tmp_path):
     rows = tmp_path / "rows.jsonl"
     command = [
@@ -88,3 +104,16 @@ def test_a_gaussian_process_learns_what_the_chosen_frames_leave_over():
             key_error(plan.trajectory, scene.path) for plan, scene in zip(plans, new, strict=True)
         ]
     assert np.median(errors["adaptive"]) < 0.5 * np.median(errors["world"])
+
+
+def test_the_benchmark_says_what_the_confidence_is_worth(tmp_path):
+    command = [
+        sys.executable, str(ROOT / "benchmarks" / "relations.py"), "--rows", str(tmp_path / "rows.jsonl"),
+        "--out", str(tmp_path), "--families", "place", "--sets", "1", "--scenes", "1", "--methods", "neighbours",
+        "--confidence",
+    ]  # fmt: skip
+    subprocess.run(command, capture_output=True, text=True, check=True)
+    table = (tmp_path / "tables" / "relations_confidence.md").read_text()
+    for kind in ("usual scenes", *UNCOVERED):
+        assert f"| neighbours | {kind} | 1, " in table
+    assert (tmp_path / "images" / "relations_confidence.svg").stat().st_size > 1000

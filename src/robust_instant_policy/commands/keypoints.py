@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import add_level, beside, positive, seed
+from robust_instant_policy.commands.options import add_keypoints, add_level, beside, positive, seed
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.evaluation import scene_seed
@@ -28,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
     parser.add_argument("--scenes", type=positive, default=20, metavar="N", help="new scenes (default: %(default)s)")
     parser.add_argument("--seed", type=seed, default=0, help="seed of the first new scene (default: %(default)s)")
-    parser.add_argument("--features", default="auto", help="image descriptors (default: %(default)s)")
+    add_keypoints(parser)
     parser.add_argument("--noise", action="store_true", help="add the noise of a stereo depth camera")
     add_level(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR-keypoints.html)")
@@ -36,12 +37,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     out = options.out or beside(options.demos, "-keypoints.html")
-    show_keypoints(options.demos, options.features, options.scenes, options.noise, options.seed, out, options.level)
+    features, correspondence = options.features or "auto", options.keypoints or "registration"
+    extractor = partial(KeypointExtractor, features=features, correspondence=correspondence)
+    show_keypoints(options.demos, extractor, options.scenes, options.noise, options.seed, out, options.level)
     return 0
 
 
 def show_keypoints(
-    demos: Path, features: str, num_scenes: int, noisy: bool, seed: int, out: Path, level: str = PAPER.name
+    demos: Path,
+    make_extractor: Callable[..., KeypointExtractor],
+    num_scenes: int,
+    noisy: bool,
+    seed: int,
+    out: Path,
+    level: str = PAPER.name,
 ) -> Path:
     """Write the page to ``out``. For a simulated task, also compare the keypoints of new scenes with the true positions
     of the same material points; ``level`` is that of these scenes and of the demonstrations. ``noisy`` adds the depth
@@ -53,13 +62,13 @@ def show_keypoints(
     images = [camera(one.observation, NOISE_SEED + index) for index, one in enumerate(demonstrations)]
     name = demonstrations[0].task
     simulated = name in TASK_NAMES and all(one.seed is not None for one in demonstrations)
-    extractor = KeypointExtractor(features=features)
+    extractor = make_extractor()
     scenes: list[Observation] = []
     accuracy = None
     if simulated:
         task: Any = make_task(name, level=level)
         try:
-            extractor = KeypointExtractor(features=features, workspace=task.workspace)
+            extractor = make_extractor(workspace=task.workspace)
             with screen.stage(f"keypoints of {len(images)} demonstrations"):
                 extractor.fit(images)
             with screen.stage(f"{num_scenes} new scenes"):

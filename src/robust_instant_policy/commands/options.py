@@ -90,7 +90,8 @@ def add_keypoints(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keypoints",
         choices=WORDS["keypoints"],
-        help="keypoints by registration of objects, or by nearest descriptors as in the paper",
+        help="keypoints by registration of objects, or by nearest descriptors as in the paper "
+        "(default: registration, or nearest with --config paper)",
     )
 
 

@@ -182,10 +182,9 @@ class Workbench:
             if isinstance(policy, KeypointPolicy):
                 policy.fit_context(self.context(variant.demos, policy.settings))
                 self._policies[variant] = RememberingPolicy(self, policy, variant.demos)
-            elif isinstance(policy, ClosedLoopPolicy):
-                self._policies[variant] = policy.fit(
-                    self._read_demonstrations(self._place[0], variant.demos, with_images=True)
-                )
+            else:  # in closed loop; what it has after `fit` only makes it no `ClosedLoopPolicy` for isinstance yet
+                shown = self._read_demonstrations(self._place[0], variant.demos, with_images=True)
+                self._policies[variant] = cast(ClosedLoopPolicy, policy).fit(shown)
         return self._policies[variant]
 
     def _analyse(

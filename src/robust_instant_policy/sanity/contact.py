@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.view import View
@@ -48,8 +49,7 @@ class GripperPath:
     @classmethod
     def of(cls, trajectory: Trajectory) -> GripperPath:
         """Thin ``trajectory`` out; idle arms, which never move, touch nothing."""
-        closed = trajectory.gripper_state > 0.5
-        closing = np.argwhere(closed[1:] & ~closed[:-1]) + np.array([1, 0])
+        closing = closings(trajectory)
         steps = np.unique(np.round(np.linspace(0, len(trajectory) - 1, PATH_STEPS)).astype(np.intp))
         steps = np.union1d(steps, closing[:, 0])
         triplets = trajectory.triplets
@@ -58,6 +58,12 @@ class GripperPath:
         fingers = (left + BETWEEN_FINGERS[:, None] * (right - left)).reshape(-1, 3)
         middles = triplets[:, :, 1:].mean(axis=2)
         return cls(fingers, kept[:, 0], kept[:, 1:].reshape(-1, 3), middles[closing[:, 0], closing[:, 1]])
+
+
+def closings(trajectory: Trajectory) -> NDArray[np.intp]:
+    """Step and arm ``(G, 2)`` of each first closed step."""
+    closed = trajectory.gripper_state > 0.5
+    return np.argwhere(closed[1:] & ~closed[:-1]) + np.array([1, 0])
 
 
 def gaps(view: View, points: FloatArray) -> FloatArray:

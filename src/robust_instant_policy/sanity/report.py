@@ -18,17 +18,15 @@ from robust_instant_policy.sanity.episodes import check_episodes
 from robust_instant_policy.sanity.finding import DemonstrationError, Finding, GeometryError, Severity, errors
 from robust_instant_policy.sanity.geometry import Evidence, evidence
 from robust_instant_policy.sanity.image import check_each_image, check_image
-from robust_instant_policy.sanity.images import (
-    ONE_SCENE_M,
-    check_contact,
+from robust_instant_policy.sanity.images import ONE_SCENE_M, check_contact, scene_spread
+from robust_instant_policy.sanity.recording import (
     check_direction,
     check_fingers,
     check_openings,
     check_rotations,
     check_tool_frame,
-    scene_spread,
 )
-from robust_instant_policy.sanity.scene import TABLE_M, check_against_scenery, check_table
+from robust_instant_policy.sanity.scene import SAME_PICTURE, TABLE_M, check_against_scenery, check_table
 from robust_instant_policy.sanity.scenery import Scenery, camera_change
 from robust_instant_policy.sanity.view import View
 
@@ -173,9 +171,9 @@ def _check_cameras(views: Sequence[View]) -> list[Finding]:
         like = scenery.likeness(views[index])
         if (
             not change.within_calibration
-            and like.depth > 0.95
+            and like.depth > SAME_PICTURE
             and scenery.textured
-            and like.texture > 0.8 * scenery.texture
+            and like.texture > SAME_PICTURE * scenery.texture
         ):
             words = f"from demonstration {index} on the camera is said to be {change}, but the picture is the same"
             numbers = {"demonstration": float(index), "moved": change.moved, "turned": change.turned}

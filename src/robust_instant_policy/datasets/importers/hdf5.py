@@ -57,7 +57,7 @@ def read(group: Any, name: str, ndim: int) -> NDArray | None:
     if not has(group, name):
         return None
     data = group[name]
-    where = f"{group.file.filename}: {group.name}/{name}"
+    where = f"{group.file.filename}: {excerpt(f'{group.name}/{name}')}"
     if not isinstance(data, h5py.Dataset) or data.dtype.kind not in "biuf":
         raise DatasetError(f"{where} is not an array of numbers")
     if data.is_virtual or data.external:
@@ -79,7 +79,7 @@ def members(group: Any, name: str) -> list[str]:
 
 def read_json_attribute(group: Any, name: str) -> dict[str, Any]:
     """The JSON object in an attribute, empty where there is none. Raises `DatasetError` for anything else."""
-    where = f"{group.file.filename}: the attribute {name} of {group.name}"
+    where = f"{group.file.filename}: the attribute {name} of {excerpt(group.name)}"
     try:
         text = group.attrs.get(name, "{}")
         content = json.loads(text) if isinstance(text, str | bytes) else None
@@ -109,5 +109,5 @@ def choose_camera(path: Path, cameras: Sequence[str], wanted: str | None) -> str
         return cameras[0] if cameras else None
     if wanted not in cameras:
         problem = "has several cameras" if wanted is None else f"has no camera {wanted!r}"
-        raise DatasetError(f"{path} {problem}; give camera= one of: {', '.join(cameras) or 'none'}")
+        raise DatasetError(f"{path} {problem}; give camera= one of: {excerpt(', '.join(cameras)) or 'none'}")
     return wanted

@@ -49,7 +49,7 @@ def read_lerobot(
     cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image") and key != depth_key]
     chosen = choose_camera(path, cameras, camera)
     if depth_key is not None and depth_key not in features:
-        raise DatasetError(f"{path} has no feature {depth_key!r}; it has: {', '.join(features)}")
+        raise DatasetError(f"{path} has no feature {depth_key!r}; it has: {excerpt(', '.join(features))}")
     if depth_key is not None and depth_unit_m is None:
         raise DatasetError(f"{path} does not say the unit of {depth_key!r}; give depth_unit_m=, metres a step")
     for episode in range(len(folder.episodes)):

@@ -24,7 +24,7 @@ from robust_instant_policy.datasets.importers.hdf5 import (
 )
 from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode, poses_of
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import read_json
+from robust_instant_policy.files import excerpt, read_json
 from robust_instant_policy.geometry import invert_pose
 
 MILLIMETRE = 1e-3
@@ -49,7 +49,11 @@ def read_maniskill(path: Path, camera: str | None) -> Iterator[SourceEpisode]:
         raise DatasetError(f"{path} holds {len(episodes)} episodes, none of them successful")
     with open_hdf5(path) as file:
         for episode in successful:
-            name = f"traj_{episode.get('episode_id')}"
+            number = episode.get("episode_id")
+            if not isinstance(number, int):
+                told = excerpt(repr(number))
+                raise DatasetError(f"{path.with_suffix('.json')}: episode_id must be a whole number, got {told}")
+            name = f"traj_{number}"
             if not has(file, name):
                 raise DatasetError(f"{path} has no {name}, which its .json lists")
             yield _read_episode(path, name, file[name], camera, episode, kwargs)

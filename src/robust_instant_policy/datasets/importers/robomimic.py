@@ -24,6 +24,7 @@ from robust_instant_policy.datasets.importers.hdf5 import (
 )
 from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode, poses_of
 from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.files import excerpt
 
 ROBOSUITE = 1  # env_type of robosuite
 ROBOSUITE_GRIPPER = GripperCommand(open=-1.0, closed=1.0)  # the same for all of robosuite's grippers
@@ -60,14 +61,14 @@ def _read_episode(
     poses = None
     if position is not None and quaternion is not None:
         if position.shape != (len(quaternion), 3) or quaternion.shape[1] != 4:
-            raise DatasetError(f"{path} ({name}): robot0_eef_pos and _quat must be (T, 3) and (T, 4)")
-        poses = poses_of(f"{path} ({name})", np.hstack([position, quaternion]), [3, 4, 5, 6])
+            raise DatasetError(f"{path} ({excerpt(name)}): robot0_eef_pos and _quat must be (T, 3) and (T, 4)")
+        poses = poses_of(f"{path} ({excerpt(name)})", np.hstack([position, quaternion]), [3, 4, 5, 6])
     from_robosuite = environment.get("env_type") == ROBOSUITE
     settings = nested(environment, "env_kwargs")
     robots = settings.get("robots", "")
     robot = robots[0] if isinstance(robots, list) and len(robots) == 1 else robots
     return SourceEpisode(
-        name=f"{path.name} ({name})",
+        name=f"{path.name} ({excerpt(name)})",
         rgb=None if images is None else images[0],
         depth=None if depth is None else depth[0, ..., 0].astype(np.float32),
         intrinsics=calibration.get("intrinsics"),

@@ -59,8 +59,9 @@ def scattered(
     rng: np.random.Generator, corners: FloatArray, count: int, fits: Callable[[FloatArray], bool]
 ) -> FloatArray:
     """Random places ``(count, 2)`` in a rectangle with ``corners (2, 2)``, metres, that fit."""
+    low, high = corners
     while True:
-        places = rng.uniform(*corners, (count, 2))
+        places = rng.uniform(low, high, (count, 2))
         if fits(places):
             return places
 

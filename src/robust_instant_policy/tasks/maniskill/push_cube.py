@@ -69,7 +69,8 @@ class PushCubeEnv(CellEnv):
 
     def draw_push(self, rng: np.random.Generator) -> tuple[FloatArray, float, float]:
         """The pose and the distance of the push, and how far the cube is turned in it, rad."""
-        return facing(*rng.uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2), 0.0), GOAL_DISTANCE_M, 0.0
+        x, y = rng.uniform(-CUBE_RANGE_M, CUBE_RANGE_M, 2)
+        return facing(x, y, 0.0), GOAL_DISTANCE_M, 0.0
 
     def failure(self) -> str:
         cube, goal = self.cube.pose.p[0], self.goal.pose.p[0]

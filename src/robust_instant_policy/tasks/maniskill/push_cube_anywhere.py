@@ -26,7 +26,7 @@ class PushCubeAnywhereEnv(PushCubeEnv):
             distance = float(rng.uniform(*DISTANCE_M))
             goal = cube + distance * np.array([np.cos(angle), np.sin(angle)])
             if (TABLE_M[0] <= goal).all() and (goal <= TABLE_M[1]).all():
-                return facing(*cube, angle), distance, -angle
+                return facing(cube[0], cube[1], angle), distance, -angle
 
 
 SPEC = replace(

@@ -56,8 +56,8 @@ class SortEnv(CellEnv):
             return apart(places) >= APART_M and abs(np.diff(distances(places))[0]) >= CLEAR_M
 
         places = scattered(rng, TABLE_M, 2, fit)
-        for number, (block, place) in enumerate(zip(self.blocks, places, strict=True)):
-            pose = facing(*place, rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
+        for number, (block, (x, y)) in enumerate(zip(self.blocks, places, strict=True)):
+            pose = facing(x, y, rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
             pose = self.layout.place(pose, [(0.0, 0.0)], corners(*SIZE_M[self.objects][:2]))
             places[number] = pose[:2, 3]
             block.set_pose(sapien.Pose(pose))

@@ -48,8 +48,8 @@ class StackEnv(CellEnv):
     def place_objects(self) -> None:
         rng = self.draw("pose")
         places = scattered(rng, TABLE_M, 2, lambda places: apart(places) >= APART_M)
-        for actor, edge, place in zip((self.cube, self.base), (EDGE_M, self.base_edge), places, strict=True):
-            pose = facing(*place, rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
+        for actor, edge, (x, y) in zip((self.cube, self.base), (EDGE_M, self.base_edge), places, strict=True):
+            pose = facing(x, y, rng.uniform(-YAW_RANGE_RAD, YAW_RANGE_RAD))
             actor.set_pose(sapien.Pose(self.layout.place(pose, [(0.0, 0.0)], corners(edge, edge))))
 
     def failure(self) -> str:
