@@ -10,6 +10,9 @@ EfficientNet's descriptors instead of DINO's, and Eq. 2 minimised by EM instead 
 - the rate: 0 to 60%, by `kat`, `mean`, `rip-gauss` and `rip` (compare Fig. 5b of Oh et al. 2025);
 - at 30%: Q, ν and downsampling (their Fig. 6).
 
+A sound answer is the same at every rate, so many plans of a scene are equal. The simulator is deterministic: equal
+trajectories in one scene are executed once, and the rows of all of them tell the outcome.
+
 `report` copies the rows to `results/hallucinations` and writes the table and the figure of the documentation.
 """
 
@@ -24,23 +27,36 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from stand_in import NAME, Server
 
-from robust_instant_policy.evaluation import Scene, Setup, Suite, Variant, read_results, run_suites, scene_seed
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.evaluation import (
+    Scene,
+    Setup,
+    Suite,
+    Variant,
+    read_results,
+    run_suites,
+    scene_seed,
+    workbench,
+)
 from robust_instant_policy.evaluation.experiment import Progress
 from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
 from robust_instant_policy.evaluation.work import Outcome, SceneWork
-from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.llm import connect
 from robust_instant_policy.policies import Settings
 from robust_instant_policy.reporting.figures import PARAMETERS, STYLES, encode
 from robust_instant_policy.reporting.tables import NONE, Table
+from robust_instant_policy.tasks import make_task
+from robust_instant_policy.tasks.task import Execution, FrameSink
+from robust_instant_policy.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[1]
 KEPT = ROOT / "results" / "hallucinations"
@@ -51,6 +67,28 @@ SWEEP_RATE = 30  # percent, at which Q, ν and downsampling are varied
 QUERIES, DOFS, WAYS = (2, 3, 5, 10), (1.25, 1.5, 3.0, math.inf), ("uniform", "masked")
 BLOCKS = (1, 2, 4, 7, 10, 15, 20)  # scenes after which every cell has equally many
 TITLE = "Trajectories from a stand-in (no language model) that hallucinates at a given rate"
+
+
+class RememberingTask:
+    """A task that executes equal trajectories in a scene once."""
+
+    def __init__(self, task: Any):
+        self._task, self._seed = task, 0
+        self._known: dict[tuple[int, bytes], Execution] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._task, name)
+
+    def reset(self, seed: int) -> Observation:
+        self._seed = seed
+        return self._task.reset(seed)
+
+    def execute(self, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
+        """Raises `UnreachableError` again where it was raised before: nothing is remembered of that."""
+        key = self._seed, trajectory.times.tobytes() + trajectory.actions.tobytes()
+        if key not in self._known:
+            self._known[key] = self._task.execute(trajectory, on_frame)
+        return self._known[key]
 
 
 def base(rate: int) -> Variant:
@@ -98,7 +136,8 @@ def run(out: Path, data: Path, tasks: Sequence[str], rates: Sequence[int], scene
         spec = f"{server.url}#{NAME}-{rate}"
         return Setup(spec, False, out / "samples.sqlite", data, 300.0, films=False, analyses=False)
 
-    with closing(Workbench(setup(0))) as bench:
+    workbench.make_task = lambda *arguments: RememberingTask(make_task(*arguments))  # type: ignore[assignment]
+    with closing(workbench.Workbench(setup(0))) as bench:
 
         def here(setup: Setup, works: list[SceneWork]) -> Iterator[Outcome]:
             bench.model = connect(setup.llm)  # type: ignore[assignment]  # a cached property

@@ -184,7 +184,7 @@ class Set:
             context, fit_s = self.context(Settings())
             assert isinstance(context.prompt, FactorisedPrompt)
             start = time.perf_counter()
-            trajectory = context.prompt.median_trajectory(scene.keypoints)
+            trajectory = context.prompt.for_scene(scene.keypoints).median_trajectory(scene.keypoints)
             yield "median", judged([trajectory], truth, fit_s=fit_s, plan_s=time.perf_counter() - start)
             return
         policies = {"neighbours": Neighbours, "gp": KeypointRegression, "gp-world": KeypointRegression}

@@ -9,7 +9,8 @@ import pytest
 
 from robust_instant_policy.context import Prompt, SequencePrompt, write_prompt
 from robust_instant_policy.context.alignment import align
-from robust_instant_policy.context.frames import Frame, robust_fit
+from robust_instant_policy.context.frames import Anchor, Axes, Frame
+from robust_instant_policy.context.things import WORLD, find_things, locate, robust_fit
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import GripperTriangle, make_pose
 from robust_instant_policy.trajectory import Trajectory
@@ -75,7 +76,9 @@ def test_a_demonstration_comes_back_from_its_own_text(frames, layout, arms):
     for demo in (0, 5):
         texts = own_answers(prompt, keypoints[demo], demo)
         back = prompt.trajectory([prompt.read(index, text) for index, text in enumerate(texts)], keypoints[demo])
-        assert np.abs(back.triplets - trajectories[demo].triplets).max() < 0.0035  # rounding, and agreed numbers
+        missed = np.abs(back.triplets - trajectories[demo].triplets).max(axis=(1, 2, 3))
+        assert missed[[0, 11, 12, 23]].max() < 0.0035  # rounding, and agreed numbers
+        assert missed.max() < (0.0035 if layout == "sequence" else 0.0065)  # and steps between those that are asked for
         assert np.array_equal(back.gripper_state, trajectories[demo].gripper_state)
 
 
@@ -99,10 +102,9 @@ def test_trajectories_of_different_length_keep_their_lengths_in_the_papers_promp
 def test_each_part_of_the_task_is_written_in_the_frame_of_its_object():
     keypoints, trajectories = demonstrations()
     frames = write_prompt(keypoints, trajectories).frames.arms[0]
-    assert frames[0].kind == "world"
-    assert set(frames[11].members) <= set(range(5))  # the grasp
-    assert set(frames[23].members) <= set(range(5, 10))  # the place
-    assert frames[11].kind in ("upright", "rigid")
+    assert str(frames[0]) == "world"
+    assert str(frames[11]) == "keypoints 0-4, axes of keypoints 0-4"  # the grasp
+    assert str(frames[23]) == "keypoints 5-9, axes of keypoints 5-9"  # the place
 
 
 def test_the_trajectory_follows_objects_that_were_moved_and_turned():
@@ -134,8 +136,10 @@ def test_a_place_between_two_objects_is_followed():
     keypoints, trajectories = demonstrations()
     prompt = write_prompt(keypoints, [half_way(*pair) for pair in zip(keypoints, trajectories, strict=True)])
     frame = prompt.frames.arms[0][-1]
-    assert frame.kind == "between"
-    assert (frame.share, frame.turn) == (0.5, 1.0)
+    assert str(frame).startswith(
+        f"{frame.share:.0%} of the way from keypoints 0-4 to keypoints 5-9, axes of keypoints 5-9"
+    )
+    assert frame.share == pytest.approx(0.5, abs=0.03)
     for seed in range(100, 110):
         new, truth = scene(seed)
         planned = prompt.median_trajectory(new)
@@ -159,24 +163,24 @@ def test_free_motion_is_written_in_interpolated_frames_and_does_not_jump():
         poses = np.stack([make_pose(DOWN, start + share * way) for share in np.linspace(0, 1, 20)])
         trajectories.append(Trajectory.from_poses(poses, np.zeros(20), TRIANGLE))
     prompt = write_prompt(keypoints[:7], trajectories[:7])
-    assert sum(frame.kind == "between" for frame in prompt.frames.arms[0]) >= 12
+    assert sum(len(frame.ends) == 2 for frame in prompt.frames.arms[0]) >= 12
     planned = prompt.median_trajectory(keypoints[7])
     assert np.linalg.norm(planned.triplets - trajectories[7].triplets, axis=-1).max() < 0.015
-    together = [{id(prompt.frames.arms[0][step]) for step, _ in question.asked} for question in prompt.questions]
-    assert max(map(len, together)) > 1  # steps on one way are asked for together, though each has a frame of its own
 
 
-def test_an_interpolated_frame_turns_with_either_end_or_by_a_share():
-    keypoints, _ = demonstrations()
-    first, second = (Frame("upright", tuple(range(5 * i, 5 * i + 5)), SHAPES[i]) for i in range(2))
-    poses = [frame.pose(keypoints[0]) for frame in (first, second)]
-    for turn, like in ((0.0, 0), (1.0, 1)):
-        pose = Frame("between", (), None, (first, second), 0.25, turn).pose(keypoints[0])
-        assert np.allclose(pose[:3, :3], poses[like][:3, :3])
-        assert np.allclose(pose[:3, 3], 0.75 * poses[0][:3, 3] + 0.25 * poses[1][:3, 3])
-    half = Frame("between", (), None, (first, second), 0.5, 0.5).pose(keypoints[0])[:3, :3]
-    step = poses[0][:3, :3].T @ half
-    assert np.allclose(poses[0][:3, :3] @ step @ step, poses[1][:3, :3])
+def test_axes_along_a_line_turn_with_it_seen_from_above_and_in_space():
+    keypoints, _ = demonstrations(3)
+    first, second = (thing for thing in find_things(keypoints) if thing.kind == "upright")
+    ends = tuple(Anchor(thing, np.array([0.01, 0.02, 0.0])) for thing in (first, second))
+    scene = locate([WORLD, first, second], keypoints)
+    line = ends[1].position(scene) - ends[0].position(scene)
+    for in_space in (False, True):
+        frame = Frame(Axes(ends, in_space), (first, second), (np.zeros(3),) * 2, share=0.25)
+        pose = frame.pose(keypoints[0])
+        expected = line[0] if in_space else line[0] * [1, 1, 0]
+        assert np.allclose(pose[:3, 0], expected / np.linalg.norm(expected))
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+        assert np.allclose(pose[:3, 3], 0.75 * scene[first].position[0] + 0.25 * scene[second].position[0])
 
 
 def test_the_expected_curvature_is_that_of_the_demonstrations_whatever_their_number():
@@ -233,7 +237,7 @@ def test_a_pose_is_fitted_to_the_majority_of_points():
     points = SHAPES[0] @ pose[:3, :3].T + pose[:3, 3]
     points[3] += 0.2
     for upright in (True, False):
-        assert np.allclose(robust_fit(SHAPES[0], points, upright), pose, atol=2e-3)
+        assert np.allclose(robust_fit(SHAPES[0], points[None], upright)[0], pose, atol=2e-3)
 
 
 def test_moving_the_whole_scene_moves_the_plan_with_it_except_where_the_world_counts():
@@ -244,21 +248,24 @@ def test_moving_the_whole_scene_moves_the_plan_with_it_except_where_the_world_co
     before = prompt.median_trajectory(new).triplets
     after = prompt.median_trajectory(new @ turn.T + shift).triplets
     for step, frame in enumerate(prompt.frames.arms[0]):
-        if frame.ends is not None and frame.ends[0].kind == "world":
+        if WORLD in frame.things and len(frame.things) > 1:
             continue
-        expected = before[step] if frame.kind == "world" else before[step] @ turn.T + shift
+        expected = before[step] if frame.things == (WORLD,) else before[step] @ turn.T + shift
         assert np.allclose(after[step], expected, atol=1e-6)
 
 
-def test_what_all_demonstrations_agree_on_is_not_asked_and_what_differs_is():
+def test_what_the_frames_predict_is_not_asked_and_what_differs_is():
     keypoints, trajectories = demonstrations()
-    prompt = write_prompt(keypoints, trajectories)
-    asked = {step for question in prompt.questions for step, _ in question.asked}
-    assert 0 not in asked  # all begin at home
-    assert {11, 23} <= asked
-    assert not any(dim == 9 for question in prompt.questions for _, dim in question.asked)
+    assert not write_prompt(keypoints, trajectories).questions
+    rng = np.random.default_rng(0)
+    for index, trajectory in enumerate(trajectories):
+        actions = trajectory.actions.copy()
+        actions[23, :9] += np.tile(rng.normal(0, 0.01, 3), 3)
+        trajectories[index] = Trajectory.from_actions(actions)
+    asked = {place for question in write_prompt(keypoints, trajectories).questions for place in question.asked}
+    assert asked == {(23, 0), (23, 1), (23, 2)}
     everything = write_prompt(keypoints[:2], trajectories[:2], "world")
-    assert sum(len(question.asked) for question in everything.questions) == 24 * 9
+    assert {dim for question in everything.questions for _, dim in question.asked} == set(range(6))
 
 
 def test_a_state_on_which_demonstrations_differ_is_asked_for():
@@ -273,11 +280,11 @@ def test_a_state_on_which_demonstrations_differ_is_asked_for():
         actions[demo, 9] = 1
         trajectories[demo] = Trajectory.from_actions(actions)
     prompt = write_prompt(keypoints, trajectories)
-    place = next(i for i, question in enumerate(prompt.questions) if any(dim == 9 for _, dim in question.asked))
+    place = next(i for i, question in enumerate(prompt.questions) if any(dim == 6 for _, dim in question.asked))
     text = own_answers(prompt, keypoints[0], 0)[place]
     assert prompt.read(place, text) is not None
     parts = text.split()
-    parts[next(i for i, (_, dim) in enumerate(prompt.questions[place].asked) if dim == 9)] = "7"
+    parts[next(i for i, (_, dim) in enumerate(prompt.questions[place].asked) if dim == 6)] = "7"
     assert prompt.read(place, " ".join(parts)) is None
 
 
@@ -308,7 +315,7 @@ def test_the_nearest_demonstration_can_be_put_last():
 @pytest.mark.parametrize("layout", ["sequence", "factorised"])
 def test_an_answer_that_cannot_be_read_is_refused(layout):
     keypoints, trajectories = demonstrations()
-    prompt = write_prompt(keypoints, trajectories, "adaptive", layout)
+    prompt = write_prompt(keypoints, trajectories, "world", layout)
     texts = own_answers(prompt, keypoints[0], 0)
     for bad in ("I am sorry, I cannot", "", "99999 " + texts[0].split(" ", 1)[1], texts[0].replace(" ", " x", 1)):
         assert prompt.read(0, bad) is None

@@ -1,3 +1,6 @@
+import shutil
+from contextlib import closing
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +11,9 @@ from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError, ModelError, UsageError
+from robust_instant_policy.evaluation import Episode, Scene, Setup, Variant, scene_seed
+from robust_instant_policy.evaluation.work import SceneWork
+from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.policies import Settings, make_policy
 from robust_instant_policy.policies.diffusion import ImageDiffusion, KeypointDiffusion, dp, training, vision
 from robust_instant_policy.policies.diffusion.denoiser import Denoiser
@@ -220,9 +226,21 @@ def test_the_command_trains_what_an_evaluation_then_finds(workbench, demonstrati
     assert main([*command, "--method", "kat-dp", "--out", str(tmp_path)]) == 0
     assert "5 steps in" in capsys.readouterr().out
     assert "demonstration 2" in next(tmp_path.glob("*.svg")).read_text()
-    make_policy("kat-dp", None, Settings(), Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
+    # An evaluation names the network that "auto" stands for.
+    make_policy("kat-dp", None, ONE, Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
     assert main([*command, "--method", "rip", "--out", str(tmp_path)]) == 2
     assert "known: dp, kat-dp" in capsys.readouterr().err
+
+
+def test_an_evaluation_trains_diffusion_policy_and_executes_it(filmed, workbench, small_images, tmp_path):
+    shutil.copytree(filmed, tmp_path / "data" / "push-cube-images")
+    shutil.copytree(workbench / "data" / "push-cube", tmp_path / "data" / "push-cube")
+    setup = Setup("none", True, tmp_path / "samples.sqlite", tmp_path / "data", 1.0, False, tmp_path / "checkpoints")
+    scene, variant = Scene("push-cube", "seen", scene_seed(0, 0)), Variant("dp", demos=2, steps=1)
+    with closing(Workbench(setup)) as bench:
+        executed = next(bench.run(SceneWork(scene, (variant,))))
+    assert isinstance(executed, Episode)
+    assert (executed.scene, executed.variant, executed.candidates) == (scene, variant, 1)
 
 
 def test_the_report_of_an_evaluation_shows_what_was_learned(workbench, demonstrations, tmp_path, monkeypatch):

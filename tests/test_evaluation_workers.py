@@ -19,6 +19,7 @@ import pytest
 
 from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
+from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation import (
     Choice,
@@ -38,6 +39,7 @@ from robust_instant_policy.evaluation import (
 from robust_instant_policy.evaluation.cluster import RayWorkers
 from robust_instant_policy.evaluation.failures import FailureAnalysis, film, true_keypoints, video_file
 from robust_instant_policy.evaluation.processes import LocalWorkers
+from robust_instant_policy.evaluation.work import Planned, SceneWork
 from robust_instant_policy.files import lock_folder
 from robust_instant_policy.policies import LocatedScene, Neighbours, Stage
 from robust_instant_policy.reporting.publication import publish
@@ -142,6 +144,25 @@ def test_rows_of_other_code_are_run_again_and_told_or_kept_on_demand(interrupted
     assert again == 3
     assert "3 plans were executed with other code" in notes[0]
     assert handed_out(old, workbench / "data", suites_of(3), keep=True) == (0, [])
+
+
+def test_plans_that_a_figure_needs_are_made_until_they_are_stored(interrupted, workbench, tmp_path):
+    folder = tmp_path / "again"
+    shutil.copytree(interrupted[0], folder)
+    suites = make_suites(["trajectories"], Choice(NEIGHBOURS, ["push-cube"], ["neighbours"], 2))
+    works: list[SceneWork] = []
+
+    def plan_one(setup, missing):
+        works.extend(missing)
+        policy = Neighbours().fit(load_demonstrations(workbench / "data/push-cube"))
+        plan = policy.plan(Observation.load(workbench / "observation.npz"))
+        yield Planned(missing[0].scene, missing[0].plans[0], plan)
+
+    for left in (2, 1):
+        works.clear()
+        run_suites(suites, setup_in(folder, workbench / "data"), folder, plan_one)
+        assert len(works) == left
+        assert not any(work.variants for work in works)
 
 
 def test_rows_with_other_demonstrations_are_not_taken_for_ones_own(interrupted, workbench, tmp_path):

@@ -154,6 +154,7 @@ def test_a_setting_that_makes_no_sense_is_refused_where_it_is_given(options):
 
 SURE = Evidence(
     agreement=0.9,
+    vote=1.0,
     distortion=0.5,
     prediction=0.008,
     novelty=0.4,
@@ -169,6 +170,7 @@ SURE = Evidence(
     "worse",
     [
         {"agreement": 0.1},
+        {"vote": 0.5},
         {"distortion": 5.0},
         {"prediction": 0.05},
         {"novelty": 4.0},

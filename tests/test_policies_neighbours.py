@@ -4,7 +4,7 @@ import pytest
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import UsageError
-from robust_instant_policy.policies import Neighbours
+from robust_instant_policy.policies import Neighbours, Plan
 from robust_instant_policy.trajectory import downsample
 
 
@@ -41,3 +41,13 @@ def test_neighbours_refuse_a_layout_without_steps_to_transfer(demonstrations, wo
     policy = Neighbours(features="efficientnet", layout="sequence").fit(demonstrations)
     with pytest.raises(UsageError, match="factorised"):
         policy.plan(Observation.load(workbench / "observation.npz"))
+
+
+def test_a_plan_says_in_which_frames_it_was_made_and_keeps_them_in_its_file(policy, workbench, tmp_path):
+    plan = policy.plan(Observation.load(workbench / "observation.npz"))
+    assert plan.frames[0].first == 0
+    assert plan.frames[-1].last == len(plan.trajectory) - 1
+    plan.save(tmp_path / "plan.json")
+    again = Plan.load(tmp_path / "plan.json")
+    assert [frame.words for frame in again.frames] == [frame.words for frame in plan.frames]
+    assert np.allclose(again.frames[0].pose, plan.frames[0].pose)

@@ -61,6 +61,22 @@ def test_a_plan_needs_keypoints_only():
         locate(context, None)
 
 
+def test_a_scene_between_two_ways_to_act_has_less_confidence_and_says_so():
+    family = FAMILIES["side"]
+    draw = family.scenes("tune", 0, 0.002)
+    shown = [draw(number) for number in range(10)]
+    context = context_of_keypoints(
+        np.stack([scene.keypoints for scene in shown]), [scene.path for scene in shown], Settings()
+    )
+    policy = Neighbours().fit_context(context)
+    keypoints = next(scene.keypoints for scene in shown if abs(scene.keypoints[:5, 1].mean()) > 0.05)
+    middle = keypoints - np.array([0.0, 1.0, 0.0]) * keypoints[:5, 1].mean() * (np.arange(10) < 5)[:, None]
+    clear, close = (policy.plan_scene(scene_of_keypoints(points)) for points in (keypoints, middle))
+    assert close.evidence["vote"] < clear.evidence["vote"]
+    assert close.confidence < clear.confidence
+    assert any("do different things" in note for note in close.notes)
+
+
 def test_the_benchmark_writes_rows_once_and_a_table(tmp_path):
     rows = tmp_path / "rows.jsonl"
     command = [

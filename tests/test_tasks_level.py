@@ -9,8 +9,9 @@ from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.sanity import check_demonstrations
 from robust_instant_policy.tasks import TASK_NAMES, UNSEEN_TASKS, make_task
+from robust_instant_policy.tasks.demonstrator import Stroke, shorter_turns
 from robust_instant_policy.tasks.level import HARD, PAPER, Layout, Region, make_level
-from robust_instant_policy.tasks.poses import facing
+from robust_instant_policy.tasks.poses import downward, facing
 from robust_instant_policy.tasks.record import record
 from robust_instant_policy.trajectory import downsample
 
@@ -61,6 +62,13 @@ def test_two_to_five_distractors_stay_clear_of_the_task_and_of_each_other():
             assert np.linalg.norm(way - at, axis=1).min() > one.radius + 0.045
             assert all(np.linalg.norm(at - other.pose[:2, 3]) > one.radius + other.radius for other in found[:index])
     assert counts == {2, 3, 4, 5}
+
+
+def test_a_hand_turns_the_shorter_way_to_an_object_that_lies_the_other_way_round():
+    behind, before = (np.array([downward(0.1, 0.0, 0.1, np.deg2rad(angle))]) for angle in (170, 20))
+    turned, same = (shorter_turns([Stroke(poses, closed=False)])[0].poses[0] for poses in (behind, before))
+    np.testing.assert_allclose(turned, downward(0.1, 0.0, 0.1, np.deg2rad(-10)), atol=1e-12)
+    np.testing.assert_array_equal(same, before[0])
 
 
 def test_an_unknown_level_is_told():

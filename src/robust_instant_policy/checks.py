@@ -34,6 +34,8 @@ def checked_array(name: str, values: ArrayLike, shape: str) -> NDArray[np.float6
     Text, booleans, complex numbers, NaN and infinity raise `InvalidValueError`.
     """
     array = as_numbers(f"{name} {shape}", values)
+    if np.asarray(values).dtype == bool:
+        raise InvalidValueError(f"{name} {shape} must be an array of numbers, got elements of type bool")
     if array.ndim != len(shape.strip("()").removesuffix(",").split(",")):
         raise InvalidValueError(f"{name} must be {shape}, got shape {array.shape}")
     if not np.isfinite(array).all():

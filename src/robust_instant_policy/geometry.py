@@ -24,7 +24,7 @@ def as_numbers(name: str, values: ArrayLike, dtype: type = np.float64) -> NDArra
     """A copy of ``values`` as an array of ``dtype``; raises `InvalidValueError` that calls it ``name``."""
     try:
         array = np.asarray(values)
-        if array.dtype.kind not in "iuf":  # NumPy would read strings and booleans, and drop imaginary parts
+        if array.dtype.kind not in "biuf":  # NumPy would read strings and drop imaginary parts
             raise ValueError(f"{array.dtype} is no type of real numbers")
         with np.errstate(over="ignore"):  # too large for float32 is infinite
             return array.astype(dtype)

@@ -31,6 +31,10 @@ class AlignedDemonstrations:
     kept: tuple[int, ...]
     key_steps: tuple[int, ...]
 
+    @property
+    def num_arms(self) -> int:
+        return self.actions.shape[2] // ACTION_DIM
+
     def curvature(self) -> FloatArray:
         """How sharply the gripper is expected to turn at each step: the standard deviation ``(T,)``, metres, of a
         coordinate's second difference.

@@ -7,19 +7,25 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import interp1d
+from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.context.codec import read_rows, row_grammar, row_pattern, write_row
+from robust_instant_policy.context.choice import NOISE_M
+from robust_instant_policy.context.codec import MM, read_rows, row_grammar, row_pattern, write_row
 from robust_instant_policy.context.frames import Frame
 from robust_instant_policy.context.prompt import INSTRUCTION, REACH_MM, Prompt
 from robust_instant_policy.context.step_frames import StepFrames
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.context.ways import Split
+from robust_instant_policy.geometry import FloatArray, fit_rigid
 from robust_instant_policy.query import Query
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
-AGREE_MM = 1.0  # a number on which all demonstrations agree this closely is not asked for
 MIN_DEMOS_TO_AGREE = 3
 INPUTS_PER_QUERY = 2  # keypoint coordinates shown with each example
 NOISE_MM = 5.0  # variation of a keypoint coordinate that carries no information
+INTERPOLATED_MM = 5.0  # a step whose numbers follow from its neighbours this closely is not asked for
+LEVER_MM = 100.0  # distance at which turns are written as lengths
+HAND_DIM, HAND_STATE = 7, 6  # numbers of a hand: point, turn, state
 STEPS_PER_QUERY = 4  # neighbouring steps asked for together: they share the examples' inputs
 
 
@@ -41,12 +47,32 @@ class Question:
 
 @dataclass(frozen=True, eq=False)
 class FactorisedPrompt(Prompt):
-    """``numbers (I, T, 10·A)`` of the aligned demonstrations, see `StepFrames`; queries ask for differences from their
-    ``median (T, 10·A)``, which is in whole millimetres."""
+    """``numbers (I, T, 7·A)`` of the aligned demonstrations, see `as_turns`; queries ask for differences from their
+    ``median (T, 7·A)``, which is in whole millimetres.
+
+    Where demonstrations do different things, ``parts`` are the prompts of their ways, between which ``split`` decides.
+    """
 
     numbers: FloatArray
     median: FloatArray
+    reference: FloatArray
     questions: tuple[Question, ...]
+    split: Split | None = None
+    parts: tuple[FactorisedPrompt, ...] = ()
+
+    @property
+    def ways(self) -> tuple[FactorisedPrompt, ...]:
+        return self.parts or (self,)
+
+    def way(self, keypoints: FloatArray) -> int:
+        return 0 if self.split is None else self.split.decide(self.frames.named(self.checked(keypoints)))[0]
+
+    def notes(self) -> tuple[str, ...]:
+        split = () if self.split is None else (str(self.split),)
+        return (*split, *super().notes())
+
+    def vote(self, keypoints: FloatArray) -> float:
+        return 1.0 if self.split is None else self.split.decide(self.frames.named(self.checked(keypoints)))[1]
 
     def queries(self, keypoints: FloatArray) -> list[Query]:
         keypoints = self.checked(keypoints)
@@ -71,63 +97,113 @@ class FactorisedPrompt(Prompt):
         if rows is None or np.abs(rows).max() > REACH_MM:
             return None
         for (step, dim), number in zip(asked, rows[0], strict=True):
-            if dim % ACTION_DIM == STATE_INDEX and number + self.median[step, dim] not in (0, 1):
+            if dim % HAND_DIM == HAND_STATE and number + self.median[step, dim] not in (0, 1):
                 return None
         return rows[0]
 
     def trajectory(self, answers: Sequence[FloatArray], keypoints: FloatArray) -> Trajectory:
-        numbers = self.median.copy()
-        for question, offsets in zip(self.questions, answers, strict=True):
-            for (step, dim), offset in zip(question.asked, offsets, strict=True):
-                numbers[step, dim] += offset
+        offsets = np.zeros_like(self.median)
+        for question, answer in zip(self.questions, answers, strict=True):
+            for (step, dim), offset in zip(question.asked, answer, strict=True):
+                offsets[step, dim] = offset
+            for dim in {dim for _, dim in question.asked}:
+                steps = [step for step, own in question.asked if own == dim]
+                between = np.arange(steps[0], steps[-1] + 1)
+                offsets[between, dim] = np.interp(between, steps, offsets[steps, dim])
+        hands = self.median + offsets
+        hands[:, HAND_STATE::HAND_DIM] = np.clip(np.round(hands[:, HAND_STATE::HAND_DIM]), 0, 1)
+        return self._decoded(keypoints, hands)
+
+    def _decoded(self, keypoints: FloatArray, hands: FloatArray) -> Trajectory:
+        numbers = from_turns(hands, self.reference)
         return Trajectory.from_actions(self.frames.decode(self.checked(keypoints), numbers))
 
     def median_trajectory(self, keypoints: FloatArray) -> Trajectory:
         """The demonstrations' median in each step's frame, without a model: a reference to measure models against."""
-        return Trajectory.from_actions(self.frames.decode(self.checked(keypoints), self.median))
+        return self._decoded(keypoints, self.median)
 
     def carried_over(self, keypoints: FloatArray, count: int) -> tuple[Trajectory, ...]:
         """The ``count`` demonstrations nearest to the scene of ``keypoints (K, 3)``, nearest first, each transferred to
         it: its numbers stay the same in each step's frame, and the frames move with the keypoints."""
         keypoints = self.checked(keypoints)
         nearest = self.by_distance(keypoints)[::-1][:count]
-        return tuple(Trajectory.from_actions(self.frames.decode(keypoints, self.numbers[demo])) for demo in nearest)
+        return tuple(self._decoded(keypoints, self.numbers[demo]) for demo in nearest)
+
+
+def as_turns(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Hands ``(I, T, 7·A)``, and the ``reference (T, A, 3, 3)`` from which they turn, of ``numbers (I, T, 10·A)``.
+
+    For each arm the point between the fingertips, millimetres; the rotation vector from the reference, in millimetres
+    at `LEVER_MM`; the gripper state. The reference are the gripper's points about that point in the most typical
+    demonstration.
+    """
+    rows = numbers.reshape(*numbers.shape[:2], -1, ACTION_DIM)
+    points = rows[..., 3:STATE_INDEX].reshape(*rows.shape[:-1], 2, 3)
+    points = np.concatenate([points, -points[..., 1:, :]], axis=-2)  # gripper point, fingertips
+    apart = np.linalg.norm(points[:, None] - points, axis=-1).sum(axis=(1, -1))  # (I, T, A), of all others
+    typical = np.argmin(apart, axis=0)
+    reference = np.take_along_axis(points, typical[None, ..., None, None], axis=0)[0]
+    rotation = fit_rigid(np.broadcast_to(reference, points.shape), points)[..., :3, :3]
+    turns = LEVER_MM * Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec().reshape(rows[..., :3].shape)
+    hands = np.concatenate([rows[..., :3], turns, rows[..., STATE_INDEX:]], axis=-1)
+    return hands.reshape(*numbers.shape[:2], -1), reference
+
+
+def from_turns(hands: FloatArray, reference: FloatArray) -> FloatArray:
+    """``numbers (T, 10·A)`` of ``hands (T, 7·A)``; the inverse of `as_turns`."""
+    rows = hands.reshape(len(hands), -1, HAND_DIM)
+    rotation = Rotation.from_rotvec(rows[..., 3:6].reshape(-1, 3) / LEVER_MM).as_matrix().reshape(*rows.shape[:2], 3, 3)
+    points = reference @ np.swapaxes(rotation, -1, -2)
+    shape = points[..., :2, :].reshape(*rows.shape[:2], 6)
+    return np.concatenate([rows[..., :3], shape, rows[..., HAND_STATE:]], axis=-1).reshape(len(hands), -1)
 
 
 def make_questions(
-    frames: StepFrames, keypoints: FloatArray, numbers: FloatArray, median: FloatArray
+    frames: StepFrames, keypoints: FloatArray, numbers: FloatArray, median: FloatArray, key_steps: Sequence[int]
 ) -> tuple[Question, ...]:
-    """What to ask of demonstrations with ``keypoints (I, K, 3)`` and ``numbers (I, T, 10·A)`` in ``frames``."""
+    """What to ask of demonstrations with ``keypoints (I, K, 3)`` and ``numbers (I, T, 7·A)`` in ``frames``."""
     shown = np.stack([frames.inputs(points) for points in keypoints])
     questions = (
         _question(arm, steps, numbers - median, shown)
         for arm, own in enumerate(frames.arms)
-        for steps in _blocks(own, STEPS_PER_QUERY)
+        for steps in _blocks(own, key_steps, (numbers - median)[..., HAND_DIM * arm : HAND_DIM * (arm + 1)])
     )
     return tuple(question for question in questions if question is not None)
 
 
-def _blocks(frames: Sequence[Frame], most: int) -> list[tuple[int, ...]]:
-    """Runs of at most ``most`` steps whose frames continue each other, of nearly equal length."""
+def _blocks(frames: Sequence[Frame], key_steps: Sequence[int], offsets: FloatArray) -> list[list[int]]:
+    """Steps to ask for together, at most `STEPS_PER_QUERY`.
+
+    Of each run of frames that continue each other, the key steps, and as many others as give the demonstrations'
+    ``offsets (I, T, 7)`` by interpolation.
+    """
     changes = [step for step in range(1, len(frames)) if not frames[step].continues(frames[step - 1])]
     blocks = []
     for start, stop in pairwise([0, *changes, len(frames)]):
-        for part in np.array_split(np.arange(start, stop), -(-(stop - start) // most)):
-            blocks.append(tuple(int(step) for step in part))
+        asked = sorted({start, stop - 1, *(key for key in key_steps if start <= key < stop)})
+        while True:
+            if len(asked) == stop - start:
+                break
+            between = interp1d(asked, offsets[:, asked], axis=1)(np.arange(start, stop))
+            missed = np.abs(between - offsets[:, start:stop]).max(axis=(0, 2))
+            if missed.max() <= INTERPOLATED_MM:
+                break
+            asked = sorted([*asked, start + int(np.argmax(missed))])
+        blocks += [list(map(int, part)) for part in np.array_split(asked, -(-len(asked) // STEPS_PER_QUERY))]
     return blocks
 
 
 def _question(arm: int, steps: Sequence[int], offsets: FloatArray, shown: FloatArray) -> Question | None:
-    """The question about ``steps`` of ``arm``, from the demonstrations' ``offsets (I, T, 10·A)`` from their median and
+    """The question about ``steps`` of ``arm``, from the demonstrations' ``offsets (I, T, 7·A)`` from their median and
     the ``shown (I, T, A, 3·K)`` keypoints, all in millimetres; None where all demonstrations agree."""
     whole = np.round(offsets).astype(int)
     largest = np.abs(whole).max(axis=0)
-    is_state = np.arange(offsets.shape[2]) % ACTION_DIM == STATE_INDEX
+    is_state = np.arange(offsets.shape[2]) % HAND_DIM == HAND_STATE
     if len(offsets) >= MIN_DEMOS_TO_AGREE:
-        varies = np.where(is_state, largest > 0, np.abs(offsets).max(axis=0) > AGREE_MM)
+        varies = np.where(is_state, largest > 0, np.sqrt((offsets**2).mean(axis=0)) > MM * NOISE_M)
     else:
         varies = np.broadcast_to(~is_state, largest.shape)
-    own = range(ACTION_DIM * arm, ACTION_DIM * (arm + 1))
+    own = range(HAND_DIM * arm, HAND_DIM * (arm + 1))
     asked = tuple((step, dim) for step in steps for dim in own if varies[step, dim])
     if not asked:
         return None

@@ -8,8 +8,9 @@ import numpy as np
 
 from robust_instant_policy.context.alignment import align
 from robust_instant_policy.context.codec import MM
-from robust_instant_policy.context.factorised import informative_inputs
-from robust_instant_policy.context.step_frames import StepFrames
+from robust_instant_policy.context.factorised import FactorisedPrompt, informative_inputs
+from robust_instant_policy.context.prompt import Prompt
+from robust_instant_policy.context.writing import write_prompt
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
@@ -18,26 +19,36 @@ RIDGE_MM = 20.0  # standard deviation of an input below which it explains little
 
 
 def leave_one_out(
-    keypoints: FloatArray, trajectories: Sequence[Trajectory], frames: StepFrames | None = None
+    keypoints: FloatArray, trajectories: Sequence[Trajectory], prompt: Prompt | None = None
 ) -> FloatArray:
     """Error ``(I, S)``, metres, with which each demonstration is predicted from the others, at S key steps.
 
-    Predicted are the gripper point and the fingertips of each arm in the ``frames`` of the steps (by default those in
-    which the demonstrations agree best), by ridge regression on the keypoint coordinates that a language model would be
-    shown; the error is that of the worst point. Key steps are the first and the last one and both sides of every
-    gripper change. ``keypoints (I, K, 3)`` in metres. NaN with fewer than `MIN_DEMOS` demonstrations that do the same.
+    Predicted are the gripper point and the fingertips of each arm in the frames of the steps, from the demonstrations
+    that go the same way, by ridge regression on the keypoint coordinates that a language model would be shown; the
+    error is that of the worst point. Frames and ways are those of ``prompt``, by default of the adaptive one. Key steps
+    are the first and the last one and both sides of every gripper change. ``keypoints (I, K, 3)`` in metres. NaN with
+    fewer than `MIN_DEMOS` demonstrations that use the gripper alike.
     """
     aligned = align(trajectories)
-    keypoints, actions = keypoints[list(aligned.kept)], aligned.actions
-    errors = np.zeros((len(actions), len(aligned.key_steps)))
-    if len(actions) < MIN_DEMOS:
+    errors = np.zeros((len(aligned.kept), len(aligned.key_steps)))
+    if len(errors) < MIN_DEMOS:
         return np.full_like(errors, np.nan)
-    if frames is None or len(frames.arms[0]) != actions.shape[1]:
-        frames = StepFrames.adaptive(keypoints, actions, aligned.key_steps)
-    numbers = np.stack([frames.encode(points, own) for points, own in zip(keypoints, actions, strict=True)])
-    shown = np.stack([frames.inputs(points) for points in keypoints])  # (I, T, A, 3·K)
-    for column, step in enumerate(aligned.key_steps):
-        for arm in range(frames.num_arms):
+    if not isinstance(prompt, FactorisedPrompt) or prompt.variation is None:
+        prompt = write_prompt(keypoints, trajectories)
+    assert isinstance(prompt, FactorisedPrompt)
+    for way in prompt.ways:
+        rows = [aligned.kept.index(demo) for demo in way.shown]
+        errors[rows] = _errors(way, aligned.actions[rows], aligned.key_steps)
+    return errors
+
+
+def _errors(way: FactorisedPrompt, actions: FloatArray, key_steps: Sequence[int]) -> FloatArray:
+    errors = np.zeros((len(actions), len(key_steps)))
+    pairs = zip(way.keypoints, actions, strict=True)
+    numbers = np.stack([way.frames.encode(points, own) for points, own in pairs])
+    shown = np.stack([way.frames.inputs(points) for points in way.keypoints])  # (I, T, A, 3·K)
+    for column, step in enumerate(key_steps):
+        for arm in range(way.frames.num_arms):
             outputs = numbers[:, step, ACTION_DIM * arm : ACTION_DIM * arm + STATE_INDEX]
             inputs = shown[:, step, arm]
             chosen = list(informative_inputs(inputs, outputs))

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from robust_instant_policy.context.step_frames import StepFrames
+from robust_instant_policy.context.things import DEMOS_TO_TELL_THINGS, WORLD
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.query import Query
@@ -22,6 +23,15 @@ INSTRUCTION = (
     "Answer with the missing numbers only, in the same layout, without any other words."
 )
 
+CLOSE_VOTE = 0.5  # below which a scene lies between two ways
+CLOSE_NOTE = (
+    "the scene lies between those in which the demonstrations do different things; the better supported way is "
+    "followed (vote {:.2f}, 1 is as clear as the demonstrations)"
+)
+GUESS_NOTE = (
+    "the frames are a guess: one or two demonstrations do not tell what a motion depends on; show three or more"
+)
+
 Layout = Literal["sequence", "factorised"]
 Frames = Literal["world", "adaptive"]
 Order = Literal["given", "nearest-last"]
@@ -31,8 +41,8 @@ Order = Literal["given", "nearest-last"]
 class Prompt(ABC):
     """Serialised demonstrations; made by `write_prompt`.
 
-    ``keypoints (I, K, 3)``, metres, are those of the demonstrations that are shown, ``frames`` the frame of each step.
-    Evenly spread over a trajectory, ``curvature (B,)``, metres, bound how sharply the gripper is expected to
+    ``keypoints (I, K, 3)``, metres, are those of the demonstrations ``shown`` (indices), ``frames`` the frame of each
+    step. Evenly spread over a trajectory, ``curvature (B,)``, metres, bound how sharply the gripper is expected to
     turn (see `AlignedDemonstrations.curvature`), and ``variation (T,)``, metres, is the demonstrations'
     standard deviation in these frames; None in the world frame, where scenes vary too, and of one demonstration.
 
@@ -45,6 +55,45 @@ class Prompt(ABC):
     curvature: FloatArray
     variation: FloatArray | None
     order: Order
+    shown: tuple[int, ...]
+
+    @property
+    def ways(self) -> tuple[Prompt, ...]:
+        """One prompt for each way to act that the demonstrations show; itself where all do the same."""
+        return (self,)
+
+    def way(self, keypoints: FloatArray) -> int:
+        """Which of ``ways`` applies in the scene of ``keypoints (K, 3)``."""
+        return 0
+
+    def for_scene(self, keypoints: FloatArray) -> Prompt:
+        """The prompt of the way that applies in the scene of ``keypoints (K, 3)``."""
+        return self.ways[self.way(keypoints)]
+
+    def vote(self, keypoints: FloatArray) -> float:
+        """How clearly one way applies in the scene of ``keypoints (K, 3)``: 1 is as in the demonstrations, 0 a tie."""
+        return 1.0
+
+    @property
+    def predicted_error(self) -> float:
+        """How far off, metres, demonstrations are at the worst step when each is predicted from the others."""
+        return max(frame.error for arm in self.frames.arms for frame in arm)
+
+    def outside(self, keypoints: FloatArray) -> float:
+        """How far the scene of ``keypoints (K, 3)`` lies outside of the demonstrations in what the frames depend on; 0
+        within them, 1 by as much as they vary (`StepFrames.outside`)."""
+        return self.frames.outside(self.keypoints, self.checked(keypoints))
+
+    def notes(self) -> tuple[str, ...]:
+        """For the user, one line each: what was inferred that may be wrong."""
+        guess = len(self.shown) < DEMOS_TO_TELL_THINGS and any(frame.things != (WORLD,) for frame in self.frames.used)
+        ranks = () if self.frames.order is None else (str(self.frames.order),)
+        return (*ranks, *((GUESS_NOTE,) if guess else ()))
+
+    def scene_notes(self, keypoints: FloatArray) -> tuple[str, ...]:
+        """The same about the scene of ``keypoints (K, 3)``."""
+        vote = self.vote(keypoints)
+        return () if vote >= CLOSE_VOTE else (CLOSE_NOTE.format(vote),)
 
     @abstractmethod
     def queries(self, keypoints: FloatArray) -> list[Query]:
@@ -60,7 +109,8 @@ class Prompt(ABC):
 
     def by_distance(self, keypoints: FloatArray) -> list[int]:
         """Indices of the demonstrations by their keypoints' mean distance from ``keypoints (K, 3)``, furthest first."""
-        distances = np.linalg.norm(self.keypoints - keypoints, axis=-1).mean(axis=-1)
+        named = np.stack([self.frames.named(points) for points in self.keypoints])
+        distances = np.linalg.norm(named - self.frames.named(keypoints), axis=-1).mean(axis=-1)
         return sorted(range(len(distances)), key=lambda demo: -distances[demo])
 
     def ordered(self, examples: Sequence[str], keypoints: FloatArray) -> str:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
+from robust_instant_policy.context.choice import choose_frames
 from robust_instant_policy.context.codec import MM
-from robust_instant_policy.context.frames import WORLD, Frame, candidate_frames, choose_frames, poses_in
+from robust_instant_policy.context.frames import WORLD_FRAME, Frame
+from robust_instant_policy.context.things import WORLD, Thing, locate
+from robust_instant_policy.context.ways import Order
 from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
@@ -22,34 +26,74 @@ class StepFrames:
     """
 
     arms: tuple[tuple[Frame, ...], ...]
+    order: Order | None = None
 
     @classmethod
     def world(cls, num_steps: int, num_arms: int) -> StepFrames:
-        return cls(((WORLD,) * num_steps,) * num_arms)
+        return cls(((WORLD_FRAME,) * num_steps,) * num_arms)
 
     @classmethod
-    def adaptive(cls, keypoints: FloatArray, actions: FloatArray, key_steps: Sequence[int]) -> StepFrames:
-        """The frames in which demonstrations with ``keypoints (I, K, 3)``, aligned ``actions (I, T, 10·A)``, agree
-        best; ``key_steps`` count more (see `choose_frames`)."""
-        candidates = candidate_frames(keypoints)
-        poses = poses_in(candidates, keypoints)
-        points = actions.reshape(*actions.shape[:2], -1, ACTION_DIM)[..., :STATE_INDEX]
-        points = points.reshape(*points.shape[:-1], 3, 3)
-        return cls(
-            tuple(
-                tuple(candidates[index] for index in choose_frames(candidates, poses, points[:, :, arm], key_steps))
-                for arm in range(points.shape[2])
-            )
-        )
+    def adaptive(
+        cls,
+        keypoints: FloatArray,
+        actions: FloatArray,
+        key_steps: Sequence[int],
+        things: Sequence[Thing],
+        order: Order | None = None,
+    ) -> StepFrames:
+        """The frames in which demonstrations with ``keypoints (I, K, 3)``, named in ``order``, and aligned ``actions
+        (I, T, 10·A)`` predict each other best; ``key_steps`` count more (see `choose_frames`)."""
+        scene, hands = locate([WORLD, *things], keypoints), hands_of(actions)
+        frames = (choose_frames(things, scene, hands[:, :, arm], key_steps) for arm in range(hands.shape[2]))
+        return cls(tuple(map(tuple, frames)), order)
 
     @property
     def num_arms(self) -> int:
         return len(self.arms)
 
+    @property
+    def used(self) -> tuple[Frame, ...]:
+        """The frames of different words."""
+        return tuple({str(frame): frame for arm in self.arms for frame in arm}.values())
+
+    def uses(self, keypoints: FloatArray) -> list[tuple[str, int, int, int, FloatArray]]:
+        """Runs of frames that continue each other in the scene of ``keypoints (K, 3)``: in words, the arm, the first
+        and the last step, and the last one's pose ``(4, 4)``."""
+        poses, found = self.poses(keypoints), []
+        for arm, own in enumerate(self.arms):
+            changes = [step for step in range(1, len(own)) if not own[step].continues(own[step - 1])]
+            for start, stop in pairwise([0, *changes, len(own)]):
+                first, last = own[start], own[stop - 1]
+                words = str(last) if first.share == last.share else f"{first.share:.0%} to {last}"
+                found.append((words, arm, start, stop - 1, poses[stop - 1, arm]))
+        return found
+
+    def outside(self, demonstrated: FloatArray, keypoints: FloatArray) -> float:
+        """How far ``keypoints (K, 3)`` lie outside of the ``demonstrated (I, K, 3)`` scenes in what frames extrapolate.
+
+        These are the distances between the two ends of an origin and of a line, and the sizes of things. The largest
+        excess, as a share of the range that was shown.
+        """
+        ends = {frame.ends for frame in self.used}
+        ends |= {tuple(end.thing for end in frame.axes.ends) for frame in self.used}
+        pairs = [own for own in ends if len(own) == 2]
+        sizes = {thing for frame in self.used for thing, _ in frame.growth}
+        every = np.stack([self.named(points) for points in [*demonstrated, keypoints]])
+        scene = locate([thing for own in [*pairs, tuple(sizes)] for thing in own], every)
+        values = [np.linalg.norm(scene[a].position - scene[b].position, axis=1) for a, b in pairs]
+        values += [scene[thing].size for thing in sizes]
+        return max((_excess(own[:-1], own[-1]) for own in values), default=0.0)
+
     def poses(self, keypoints: FloatArray) -> FloatArray:
         """Pose of each step's frame ``(T, A, 4, 4)`` in the scene of ``keypoints (K, 3)``."""
+        keypoints = self.named(keypoints)
         frames = [frame for of_step in zip(*self.arms, strict=True) for frame in of_step]
-        return poses_in(frames, keypoints[None])[:, 0].reshape(-1, self.num_arms, 4, 4)
+        scene = locate([thing for frame in frames for thing in frame.things], keypoints[None])
+        return np.stack([frame.pose_in(scene)[0] for frame in frames]).reshape(-1, self.num_arms, 4, 4)
+
+    def named(self, keypoints: FloatArray) -> FloatArray:
+        """``keypoints (K, 3)`` by the names that they have in the frames."""
+        return keypoints if self.order is None else self.order.renamed(keypoints[None])[0]
 
     def encode(self, keypoints: FloatArray, actions: FloatArray) -> FloatArray:
         """The numbers ``(T, 10·A)`` of ``actions (T, 10·A)`` in the scene of ``keypoints (K, 3)``."""
@@ -77,8 +121,21 @@ class StepFrames:
     def inputs(self, keypoints: FloatArray) -> FloatArray:
         """``keypoints (K, 3)`` in each step's frame, millimetres ``(T, A, 3·K)``."""
         poses = self.poses(keypoints)
-        shown = [MM * transform_points(invert_pose(pose), keypoints).ravel() for pose in poses.reshape(-1, 4, 4)]
+        named = self.named(keypoints)
+        shown = [MM * transform_points(invert_pose(pose), named).ravel() for pose in poses.reshape(-1, 4, 4)]
         return np.reshape(shown, (*poses.shape[:2], -1))
+
+
+def _excess(shown: FloatArray, value: float) -> float:
+    """By how much ``value`` lies outside of the range of the ``shown (I,)`` values, as a share of it."""
+    low, high = float(shown.min()), float(shown.max())
+    return max(low - value, value - high, 0.0) / max(high - low, 1e-3)
+
+
+def hands_of(actions: FloatArray) -> FloatArray:
+    """The gripper's three points ``(..., A, 3, 3)`` of ``actions (..., 10·A)``."""
+    points = actions.reshape(*actions.shape[:-1], -1, ACTION_DIM)[..., :STATE_INDEX]
+    return points.reshape(*points.shape[:-1], 3, 3)
 
 
 def _points(numbers: FloatArray) -> FloatArray:

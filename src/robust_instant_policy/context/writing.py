@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
 
-from robust_instant_policy.context.alignment import align
-from robust_instant_policy.context.factorised import FactorisedPrompt, make_questions
+from robust_instant_policy.context.alignment import AlignedDemonstrations, align
+from robust_instant_policy.context.factorised import FactorisedPrompt, as_turns, make_questions
 from robust_instant_policy.context.prompt import Frames, Layout, Order, Prompt
 from robust_instant_policy.context.sequence import SequencePrompt, raw_rows, sequence_example
-from robust_instant_policy.context.step_frames import StepFrames
+from robust_instant_policy.context.step_frames import StepFrames, hands_of
+from robust_instant_policy.context.things import WORLD, find_things, locate
+from robust_instant_policy.context.ways import find_order, find_split
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, Trajectory
@@ -47,34 +50,94 @@ def write_prompt(
     num_arms = widths.pop() // ACTION_DIM
 
     aligned = align(trajectories)
-    bounds = aligned.curvature()
     if frames == "world" and layout == "sequence":  # as in the paper: trajectories as they are, each of its own length
         lengths = [len(trajectory) for trajectory in trajectories]
         pairs = zip(keypoints, map(raw_rows, trajectories), strict=True)
         return SequencePrompt(
             keypoints,
             StepFrames.world(max(lengths), num_arms),
-            np.full_like(bounds, bounds.max()),
+            np.full_like(aligned.curvature(), aligned.curvature().max()),
             variation=None,
             order=order,
+            shown=tuple(range(len(keypoints))),
             examples=tuple(sequence_example(points, rows) for points, rows in pairs),
             lengths=(min(lengths), max(lengths)),
             raw=True,
         )
     keypoints, actions = keypoints[list(aligned.kept)], aligned.actions
-    num_steps = actions.shape[1]
-    if frames == "world":
-        chosen = StepFrames.world(num_steps, num_arms)
-    else:
-        chosen = StepFrames.adaptive(keypoints, actions, aligned.key_steps)
-    numbers = np.stack([chosen.encode(points, own) for points, own in zip(keypoints, actions, strict=True)])
-    variation = chosen.variation(numbers) if frames == "adaptive" and len(numbers) > 1 else None
     if layout == "sequence":
-        pairs = zip(keypoints, np.round(numbers), strict=True)
-        examples = tuple(sequence_example(points, rows) for points, rows in pairs)
-        return SequencePrompt(
-            keypoints, chosen, bounds, variation, order, examples, lengths=(num_steps, num_steps), raw=False
-        )
-    median = np.round(np.median(numbers, axis=0))
-    questions = make_questions(chosen, keypoints, numbers, median)
-    return FactorisedPrompt(keypoints, chosen, bounds, variation, order, numbers, median, questions)
+        return _sequence(keypoints, aligned, frames, order)
+    if frames == "world":
+        every = np.arange(len(keypoints))
+        return _factorised(StepFrames.world(actions.shape[1], num_arms), keypoints, aligned, every, False, order)
+    return _adaptive(keypoints, aligned, order)
+
+
+def _sequence(keypoints: FloatArray, aligned: AlignedDemonstrations, frames: Frames, order: Order) -> SequencePrompt:
+    steps = aligned.actions.shape[1]
+    if frames == "world":
+        chosen = StepFrames.world(steps, aligned.num_arms)
+    else:
+        chosen = StepFrames.adaptive(keypoints, aligned.actions, aligned.key_steps, find_things(keypoints))
+    numbers = np.stack([chosen.encode(points, own) for points, own in zip(keypoints, aligned.actions, strict=True)])
+    variation = chosen.variation(numbers) if frames == "adaptive" and len(numbers) > 1 else None
+    pairs = zip(keypoints, np.round(numbers), strict=True)
+    examples = tuple(sequence_example(points, rows) for points, rows in pairs)
+    return SequencePrompt(
+        keypoints,
+        chosen,
+        aligned.curvature(),
+        variation,
+        order,
+        aligned.kept,
+        examples,
+        lengths=(steps, steps),
+        raw=False,
+    )
+
+
+def _adaptive(keypoints: FloatArray, aligned: AlignedDemonstrations, order: Order) -> FactorisedPrompt:
+    """One prompt for each way to act, within the prompt of the way that more demonstrations go."""
+    hands = hands_of(aligned.actions[:, list(aligned.key_steps)])
+    ranks = find_order(keypoints, hands)
+    named = keypoints if ranks is None else ranks.renamed(keypoints)
+    things = find_things(named)
+    found = find_split(things, locate([WORLD, *things], named), hands)
+    sides = [np.ones(len(named), dtype=bool)] if found is None else [~found[1], found[1]]
+    ways = []
+    for side in sides:
+        shown = np.flatnonzero(side)
+        chosen = StepFrames.adaptive(named[shown], aligned.actions[shown], aligned.key_steps, things, ranks)
+        ways.append(_factorised(chosen, keypoints, aligned, shown, True, order))
+    if found is None:
+        return ways[0]
+    most = max(ways, key=lambda way: len(way.shown))
+    return replace(most, split=found[0], parts=tuple(ways))
+
+
+def _factorised(
+    frames: StepFrames,
+    keypoints: FloatArray,
+    aligned: AlignedDemonstrations,
+    shown: np.ndarray,
+    vary: bool,
+    order: Order,
+) -> FactorisedPrompt:
+    keypoints, actions = keypoints[shown], aligned.actions[shown]
+    numbers = np.stack([frames.encode(points, own) for points, own in zip(keypoints, actions, strict=True)])
+    variation = frames.variation(numbers) if vary and len(numbers) > 1 else None
+    hands, reference = as_turns(numbers)
+    median = np.round(np.median(hands, axis=0))
+    questions = make_questions(frames, keypoints, hands, median, aligned.key_steps)
+    return FactorisedPrompt(
+        keypoints,
+        frames,
+        aligned.curvature(),
+        variation,
+        order,
+        tuple(aligned.kept[index] for index in shown),
+        hands,
+        median,
+        reference,
+        questions,
+    )

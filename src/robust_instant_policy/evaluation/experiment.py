@@ -93,8 +93,9 @@ def run_suites(
             )
         done = sum(is_complete(executed.get(trial, ())) for trial in trials)
         progress.outcome(done, len(trials), None)
-        drawn = set(wanted_trials(suite for suite in suites if suite.keeps_plans))
-        kept = {trial for trial in trials if _apart_from("demonstrations", trial) in drawn}
+        chosen = partial(_apart_from, "demonstrations")
+        drawn = set(map(chosen, wanted_trials(suite for suite in suites if suite.keeps_plans)))
+        kept = {trial for trial in trials if chosen(trial) in drawn}
         works = missing_work(trials, kept, executed, results.failures, out, setup.films, setup.analyses)
         if not works:
             return

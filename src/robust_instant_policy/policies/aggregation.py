@@ -18,7 +18,7 @@ from robust_instant_policy.policies.confidence import (
     prediction,
 )
 from robust_instant_policy.policies.context import Context, LocatedScene
-from robust_instant_policy.policies.policy import Plan, Stage, Stopwatch, Usage
+from robust_instant_policy.policies.policy import FrameUse, Plan, Stage, Stopwatch, Usage
 from robust_instant_policy.policies.sampling import Proposal
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.regression import RobustTrajectory, robust_gripper_trajectory
@@ -33,7 +33,8 @@ def aggregate(context: Context, scene: LocatedScene, proposal: Proposal, setting
     """
     watch = Stopwatch()
     with watch.stage("regression"):
-        robust = agree(proposal, settings, context.prompt.curvature, context.prompt.variation)
+        prompt = context.prompt.for_scene(scene.keypoints)
+        robust = agree(proposal, settings, prompt.curvature, prompt.variation)
     return make_plan(context, scene, proposal, robust, watch.stages, judged=True)
 
 
@@ -93,6 +94,7 @@ def make_plan(
     findings = (*context.report.findings, *scene.findings, *outside)
     evidence = Evidence(
         agreement=chosen.confidence,
+        vote=context.prompt.vote(scene.keypoints),
         distortion=distortion(context.keypoints, scene.keypoints),
         prediction=prediction(context.prediction_errors),
         novelty=novelty(context.keypoints, scene.keypoints),
@@ -118,5 +120,14 @@ def make_plan(
         pixels=scene.located.pixels,
         keypoint_confidence=scene.located.confidence,
         usage=Usage((scene.stage, *proposal.stages, *stages)),
-        notes=(*context.notes, *scene.notes, *proposal.notes, *map(str, outside), *beside, *unknown),
+        frames=tuple(FrameUse(*use) for use in context.prompt.for_scene(scene.keypoints).frames.uses(scene.keypoints)),
+        notes=(
+            *context.notes,
+            *scene.notes,
+            *context.prompt.scene_notes(scene.keypoints),
+            *proposal.notes,
+            *map(str, outside),
+            *beside,
+            *unknown,
+        ),
     )

@@ -1,6 +1,6 @@
 """The confidence of a plan: a calibrated probability that it is right.
 
-    P(right) = min(1, agreement / GOOD_AGREEMENT) · sigmoid(b_0 + Σ_j b_j f_j),   f_j <= 0
+    P(right) = min(1, agreement / GOOD_AGREEMENT) · (1 + vote) / 2 · sigmoid(b_0 + Σ_j b_j f_j),   f_j <= 0
 
 The features f_j are made from `Evidence` and are 0 where nothing speaks against the plan; the coefficients were fitted
 to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A
@@ -48,7 +48,8 @@ MIN_SCENES = 3  # below which nothing is known of their variation
 class Evidence:
     """What speaks for or against a plan. NaN is unknown.
 
-    ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``distortion`` of the distances between
+    ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``vote`` in [0, 1] for the way to act
+    that was followed, 0 where either of two may be meant (`Prompt.vote`); ``distortion`` of the distances between
     keypoints (see `distortion`); ``prediction``, metres, the error with which demonstrations predict each other at the
     key step at which they do so best (see `prediction`); ``novelty``, how far the scene lies from the demonstrations
     (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and ``precision``, that
@@ -57,6 +58,7 @@ class Evidence:
     """
 
     agreement: float
+    vote: float
     distortion: float
     prediction: float
     novelty: float
@@ -97,7 +99,8 @@ def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEF
     if evidence.errors:
         return 0.0
     score = coefficients["constant"] + sum(coefficients[name] * value for name, value in evidence.features().items())
-    probability = float(min(1.0, evidence.agreement / GOOD_AGREEMENT) / (1 + np.exp(-score)))
+    vote = evidence.vote if np.isfinite(evidence.vote) else 1.0
+    probability = float(min(1.0, evidence.agreement / GOOD_AGREEMENT) * (1 + vote) / 2 / (1 + np.exp(-score)))
     return probability if evidence.is_known else min(probability, UNKNOWN)
 
 

@@ -87,7 +87,7 @@ def build_context(
         settings.seed,
         settings.descriptors,
         settings.keypoints,
-    ).fit([demonstration.observation for demonstration in demonstrations])
+    ).fit([one.observation for one in demonstrations], [one.trajectory for one in demonstrations])
     given = context_of_keypoints(extractor.keypoints_, [one.trajectory for one in demonstrations], settings)
     aligned = align(given.trajectories)
     views = [View.of(demonstrations[index].observation) for index in aligned.kept]
@@ -98,7 +98,7 @@ def build_context(
         pixels=extractor.pixels_,
         report=report,
         surroundings=Surroundings.of(views, aligned.actions),
-        notes=(*extractor.notes_, *report.notes),
+        notes=(*extractor.notes_, *report.notes, *given.notes),
     )
 
 
@@ -118,8 +118,8 @@ def context_of_keypoints(keypoints: FloatArray, trajectories: Sequence[Trajector
         prompt,
         SetReport((), Envelope.of(trajectories, HORIZONTAL), None),
         Surroundings.of((), align(thinned).actions),
-        leave_one_out(keypoints, thinned, prompt.frames if settings.frames == "adaptive" else None),
-        (),
+        leave_one_out(keypoints, thinned, prompt),
+        prompt.notes(),
     )
 
 

@@ -19,7 +19,7 @@ from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
 from robust_instant_policy.policies.policy import Plan, Stopwatch
 from robust_instant_policy.policies.sampling import Proposal
-from robust_instant_policy.trajectory import ACTION_DIM, Trajectory
+from robust_instant_policy.trajectory import Trajectory
 
 # The kernel's parameters, of which the likelihood chooses the logarithms: how much of the outputs' variance is linear
 # in the keypoints (per square metre), smooth in them, and noise; and over how many metres the smooth part varies.
@@ -86,36 +86,49 @@ class KeypointRegression(KeypointPolicy):
     """
 
     name = "gp"
-    process_: GaussianProcess
+    ways_: tuple[tuple[StepFrames, FloatArray, GaussianProcess], ...]
 
     def fit_context(self, context: Context) -> Self:
-        """Find the kernel's parameters, in a fraction of a second; returns itself."""
+        """Find the kernel's parameters for each way to act, in a fraction of a second; returns itself."""
         super().fit_context(context)
         aligned = align(context.trajectories)
-        keypoints = context.keypoints[list(aligned.kept)]
-        num_steps, width = aligned.actions.shape[1:]
-        self._frames = (
-            StepFrames.world(num_steps, width // ACTION_DIM)
-            if self.settings.frames == "world"
-            else context.prompt.frames
-        )
-        pairs = zip(keypoints, aligned.actions, strict=True)
-        numbers = np.stack([self._frames.encode(points, actions) for points, actions in pairs])
-        self._median = np.median(numbers, axis=0)
-        residuals = (numbers - self._median) / MM
-        self.process_ = GaussianProcess.fitted(
-            keypoints.reshape(len(keypoints), -1), residuals.reshape(len(keypoints), -1)
+        if self.settings.frames == "world":
+            num_steps = aligned.actions.shape[1]
+            ways = [(StepFrames.world(num_steps, aligned.num_arms), aligned.kept)]
+        else:
+            ways = [(way.frames, way.shown) for way in context.prompt.ways]
+        self.ways_ = tuple(
+            _fitted(
+                frames,
+                context.keypoints[list(shown)],
+                aligned.actions[[aligned.kept.index(demo) for demo in shown]],
+            )
+            for frames, shown in ways
         )
         return self
 
     def plan_scene(self, scene: LocatedScene) -> Plan:
+        way = 0 if len(self.ways_) == 1 else self.context_.prompt.way(scene.keypoints)
+        frames, median, process = self.ways_[way]
         watch = Stopwatch()
         with watch.stage("gaussian process"):
-            residual, deviation = self.process_.predict(scene.keypoints.reshape(1, -1))
-            numbers = self._median + MM * residual.reshape(self._median.shape)
-            trajectory = Trajectory.from_actions(self._frames.decode(scene.keypoints, numbers))
+            residual, deviation = process.predict(scene.keypoints.reshape(1, -1))
+            numbers = median + MM * residual.reshape(median.shape)
+            trajectory = Trajectory.from_actions(frames.decode(scene.keypoints, numbers))
         proposal = Proposal((trajectory,), tuple(watch.stages))
         regression = Stopwatch()
         with regression.stage("regression"):  # of one candidate: a rigid gripper, open or closed
-            rigid = replace(agree(proposal, self.settings), scale=np.full(self._median.shape, deviation[0]))
+            rigid = replace(agree(proposal, self.settings), scale=np.full(median.shape, deviation[0]))
         return make_plan(self.context_, scene, proposal, rigid, regression.stages)
+
+
+def _fitted(
+    frames: StepFrames, keypoints: FloatArray, actions: FloatArray
+) -> tuple[StepFrames, FloatArray, GaussianProcess]:
+    """``frames``, the median in them of ``actions (I, T, 10·A)`` in scenes with ``keypoints (I, K, 3)``, and the
+    process of the differences from it."""
+    numbers = np.stack([frames.encode(points, own) for points, own in zip(keypoints, actions, strict=True)])
+    median = np.median(numbers, axis=0)
+    residuals = (numbers - median) / MM
+    inputs = keypoints.reshape(len(keypoints), -1)
+    return frames, median, GaussianProcess.fitted(inputs, residuals.reshape(len(keypoints), -1))

@@ -21,7 +21,7 @@ class Neighbours(KeypointPolicy):
     name = "neighbours"
 
     def plan_scene(self, scene: LocatedScene) -> Plan:
-        prompt = self.context_.prompt
+        prompt = self.context_.prompt.for_scene(scene.keypoints)
         if not isinstance(prompt, FactorisedPrompt):
             raise UsageError("neighbours need layout='factorised'")
         watch = Stopwatch()

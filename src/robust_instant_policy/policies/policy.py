@@ -76,6 +76,18 @@ class Stopwatch:
 
 
 @dataclass(frozen=True, eq=False)
+class FrameUse:
+    """A frame in which the steps ``first`` to ``last`` of an arm were planned, in ``words``, and the last step's pose
+    ``(4, 4)``."""
+
+    words: str
+    arm: int
+    first: int
+    last: int
+    pose: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Plan:
     """A trajectory to execute, and why to trust it.
 
@@ -89,7 +101,7 @@ class Plan:
     0 where a check found an error; None from a method that has none. ``evidence`` is what it was made from, see
     `confidence.Evidence`.
     ``keypoints (K, 3)``, metres, world, ``pixels (K, 2)`` (u, v) and ``keypoint_confidence (K,)`` in [0, 1] are what
-    was recognised; ``notes`` are for the user, one line each.
+    was recognised; ``frames`` are those in which it was planned; ``notes`` are for the user, one line each.
     """
 
     trajectory: Trajectory
@@ -106,6 +118,7 @@ class Plan:
     usage: Usage = field(default_factory=Usage)
     notes: tuple[str, ...] = ()
     evidence: Mapping[str, float] = field(default_factory=dict)
+    frames: tuple[FrameUse, ...] = ()
 
     def save(self, path: str | Path) -> None:
         """Write the plan as JSON, whole or not at all. Raises `DatasetError` when that is not possible."""
@@ -118,6 +131,7 @@ class Plan:
             "usage": [vars(stage) for stage in self.usage.stages],
             "notes": list(self.notes),
             "evidence": dict(self.evidence),
+            "frames": [{**vars(frame), "pose": frame.pose.tolist()} for frame in self.frames],
         }
         write_whole(Path(path), (json.dumps(content, allow_nan=False) + "\n").encode())
 
@@ -142,6 +156,7 @@ class Plan:
                 usage=Usage(tuple(_stage(stage) for stage in content["usage"])),
                 notes=_checked_notes(content["notes"]),
                 evidence=_checked_evidence(content.get("evidence", {})),  # plans of version 0.1 have none
+                frames=tuple(_frame(frame) for frame in content.get("frames", [])),
                 **{name: _array(content, name, sizes) for name in _ARRAYS},
             )
         except OSError as error:
@@ -184,6 +199,16 @@ def _stage(content: dict) -> Stage:
     ):
         raise ValueError("its usage holds something other than a name and what a stage cost")
     return stage
+
+
+def _frame(content: dict) -> FrameUse:
+    frame = FrameUse(**{**content, "pose": as_numbers("pose", content["pose"])})
+    steps = frame.arm, frame.first, frame.last
+    if not isinstance(frame.words, str) or not all(isinstance(step, int) for step in steps):
+        raise ValueError("its frames hold something other than words and steps")
+    if frame.pose.shape != (4, 4) or not np.isfinite(frame.pose).all():
+        raise ValueError(f"the pose of a frame must be (4, 4) and finite, got {frame.pose.shape}")
+    return frame
 
 
 def _checked_evidence(value: object) -> dict[str, float]:

@@ -57,7 +57,8 @@ def sample(
 
     ``deadline_s`` bounds the wall time of all of them. Raises `ModelError` where the model cannot be used.
     """
-    queries = context.prompt.queries(scene.keypoints)
+    prompt = context.prompt.for_scene(scene.keypoints)
+    queries = prompt.queries(scene.keypoints)
     if earlier.num_asked >= num_queries or earlier.seconds >= deadline_s or not queries:
         return earlier
     refused: list[Answer] = []
@@ -77,7 +78,7 @@ def sample(
             deadline_s - earlier.seconds,
         ),
         Listener(
-            accept=context.prompt.read,
+            accept=prompt.read,
             on_progress=lambda done, total: progress("language model", done, total),
             on_answer=keep_refused,
         ),
@@ -112,8 +113,9 @@ def propose(context: Context, scene: LocatedScene, samples: Samples, num_queries
             f"{count} of {num_queries} trajectories came in {samples.seconds:.0f} s, {needed} are needed "
             f"({complete} of {len(answers)} prompts were answered in full); {advice}"
         )
+    prompt = context.prompt.for_scene(scene.keypoints)
     candidates = tuple(
-        context.prompt.trajectory([own[index].value for own in answers], scene.keypoints) for index in range(count)
+        prompt.trajectory([own[index].value for own in answers], scene.keypoints) for index in range(count)
     )
     notes = () if count == num_queries else (f"{count} of {num_queries} answers were usable in time",)
     return Proposal(candidates, (_cost(samples.seconds, answers),), notes)

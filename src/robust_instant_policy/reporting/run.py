@@ -42,6 +42,7 @@ from robust_instant_policy.reporting.tables import NONE, Table
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 SHOWN_DEMONSTRATIONS = 10
+FRAME_AXIS_M = 0.04  # length of the axes of a frame in the picture
 MOSTLY = 0.5  # mean weight below which a hallucinated candidate was ignored more than followed
 RUN_FILE, PLAN_FILE, SEEN_FILE, CONTEXT_FILE, VIDEO_FILE, REPORT_FILE = (
     "run.json",
@@ -112,6 +113,8 @@ def write_report(folder: str | Path) -> Path:
         seen=picture(observation.rgb, "new scene", marks=keypoint_marks(plan.pixels, plan.keypoint_confidence)),
         shown=shown[:SHOWN_DEMONSTRATIONS],
         keypoints=_keypoint_table(plan),
+        framed=_frames_over_scene(observation, plan),
+        frames=_frame_table(plan),
         paths=chart(paths_in_space(plan)),
         judged=plan.confidence is not None,
         candidates=_candidate_table(plan),
@@ -165,6 +168,23 @@ def _candidates_over_scene(observation: Observation, plan: Plan) -> Picture:
         dash = f"{2 * unit:.2f}" if plan.hallucinated[index] else ""
         drawn += lines(candidate, candidate_colour(plan, index), 1.1, dash, candidate_name(plan, index))
     return picture(observation.rgb, "new scene with the candidates and, black, the trajectory that was planned", drawn)
+
+
+def _frames_over_scene(observation: Observation, plan: Plan) -> Picture:
+    """The scene with the axes x, y, z of each frame, red, green and blue, where its last step is planned."""
+    unit = observation.rgb.shape[1] / REFERENCE_WIDTH
+    drawn = []
+    for frame in plan.frames:
+        for axis, colour in enumerate(("#d62728", "#2ca02c", "#1f77b4")):
+            ends = frame.pose[:3, 3] + np.stack([np.zeros(3), FRAME_AXIS_M * frame.pose[:3, axis]])
+            title = f"steps {frame.first} to {frame.last}: {frame.words}"
+            drawn.append(Line(svg_points(ends, observation), colour, 2.2 * unit, "", title))
+    return picture(observation.rgb, "new scene with the frames in which the plan was made", drawn)
+
+
+def _frame_table(plan: Plan) -> Table:
+    rows = [(f"{frame.arm + 1}", f"{frame.first} to {frame.last}", frame.words) for frame in plan.frames]
+    return Table(("arm", "steps", "frame: origin, axes"), tuple(rows), "")
 
 
 def _keypoint_table(plan: Plan) -> Table:

@@ -26,6 +26,7 @@ AIM_ERROR_RAD = 0.02
 TREMOR_M = 0.0004
 TREMOR_HZ = (0.6, 3.5)
 TREMOR_WAVES = 4
+STRAIGHT_DOWN = -0.99  # or below: the vertical part of an approach
 GRIP_PAUSE_S = (0.4, 0.65)  # the demonstrator waits for the fingers
 
 
@@ -49,16 +50,17 @@ class Stroke:
     waits: bool = False
 
 
-def shorter_turns(starts: FloatArray, strokes: Sequence[Stroke]) -> list[Stroke]:
-    """``strokes`` with the hands of arms rotated by half a turn about their approach where that is nearer to their
-    ``starts (A, 4, 4)``: the two fingers of a parallel gripper are interchangeable."""
+def shorter_turns(strokes: Sequence[Stroke]) -> list[Stroke]:
+    """``strokes`` with hands rotated by half a turn about their approach where they would turn by more than 90 degrees.
+
+    The two fingers of a parallel gripper are interchangeable. Hands that point straight down are rotated, an arm's all
+    together, where the first would turn from the world's x axis to the other side.
+    """
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     rotated: dict[int, bool] = {}
     for stroke in strokes:
-        if stroke.arm not in rotated:
-            turn = Rotation.from_matrix(starts[stroke.arm, :3, :3].T @ stroke.poses[0, :3, :3])
-            _, _, z, w = turn.as_quat()
-            rotated[stroke.arm] = bool(abs(z) > abs(w))  # the twist about the approach, z, is more than 90 degrees
+        first = stroke.poses[0]
+        rotated.setdefault(stroke.arm, bool(first[2, 2] < STRAIGHT_DOWN and first[0, 0] < 0))
     return [replace(one, poses=one.poses @ half_turn) if rotated[one.arm] else one for one in strokes]
 
 

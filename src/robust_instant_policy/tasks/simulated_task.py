@@ -150,7 +150,7 @@ class SimulatedTask:
         strokes = self._spec.expert(self._cell, rng)
         home = np.stack([arm.home_pose for arm in self._arms])
         if self._level.turn:
-            strokes = shorter_turns(home, strokes)
+            strokes = shorter_turns(strokes)
         poses, closed = perform(home, strokes, rng, self._timing.control_hz)
         images: list[Image] = []
         try:

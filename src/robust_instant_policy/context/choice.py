@@ -1,0 +1,288 @@
+"""Which frame each step is written in: the one that predicts a demonstration best from the others.
+
+A candidate is a choice of axes R and of the one or two things on which the origin depends. In a scene, the hand's
+centre is
+
+    y = o + X w,   X = [o' - o | B | B' | R | (s - 1) R …]
+
+with o, o' the things' positions, B, B' their axes, and s the sizes of things that have one: share of the way, points
+fixed in the things, offset in the axes and its growth are all linear. Ridge regression gives w, and its hat matrix H
+the residuals of each demonstration when it is left out, (I - H_ii)⁻¹ r_i, for all candidates and steps at once (the
+keypoints of the one that is left out are noisy, too). The hand's turn is predicted by the mean of the others' in the
+axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from robust_instant_policy.context.frames import Anchor, Axes, Frame
+from robust_instant_policy.context.things import (
+    DEMOS_TO_TELL_THINGS,
+    WORLD,
+    Scene,
+    Thing,
+)
+from robust_instant_policy.geometry import FloatArray
+
+NOISE_M = 0.003  # of demonstrated points in a frame that suits them
+# Standard deviations a priori of what is fitted: share of the way; a point in a thing, an offset, its growth in metres.
+SHARE_STD, POINT_STD_M, OFFSET_STD_M, GROWTH_STD_M = 0.7, 0.02, 0.5, 0.1
+PARAMETER_COST = 0.04  # of a fitted number, in logarithms of the error
+TRANSITION_COST = 1.0  # of a change of frame between two steps, in logarithms of the error
+KEY_STEP_WEIGHT = 3.0  # of the first and last step and of gripper changes; 1 elsewhere
+# Expected error of a single demonstration, a metre to a thing that is seen in its own axes, and to one that has none.
+DISTANCE_SHARE, UNTURNED_SHARE = 0.05, 0.3
+MAX_LOOSE = 4  # keypoints of their own, between which lines are drawn
+
+ZERO = np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """All combinations of ``axes`` and ``origins`` for demonstrations in ``scene``.
+
+    An origin is one or two things, and those with whose size it moves.
+    """
+
+    scene: Scene
+    axes: tuple[Axes, ...]
+    origins: tuple[tuple[tuple[Thing, ...], tuple[Thing, ...]], ...]
+    growing: tuple[Thing, ...]
+
+    @classmethod
+    def of(cls, things: Sequence[Thing], scene: Scene) -> Candidates:
+        still = [WORLD, *(thing for thing in things if thing.kind in ("upright", "scaled"))]
+        points = [thing for thing in things if thing.kind == "point"]
+        sized = {member for thing in things if thing.kind == "scaled" for member in thing.members}
+        loose = [point for point in points if sized.isdisjoint(point.members)]
+        ends = still + (loose if len(loose) <= MAX_LOOSE else [])
+        few = len(scene[WORLD].size) < DEMOS_TO_TELL_THINGS
+        pairs = [] if few else list(combinations(ends, 2))
+        axes = [Axes((Anchor(thing, ZERO),)) for thing in (WORLD, *things) if thing is WORLD or thing.turns]
+        for pair in pairs:
+            line = Axes(tuple(Anchor(thing, ZERO) for thing in pair))
+            axes.append(line)
+            rise = np.ptp(scene[pair[1]].position[:, 2] - scene[pair[0]].position[:, 2])
+            if rise > 10 * NOISE_M and WORLD not in pair:
+                axes.append(replace(line, in_space=True))
+        singles = [(thing,) for thing in (*still, *points, *(t for t in things if t.kind == "hinged"))]
+        growing = tuple(thing for thing in things if thing.kind == "scaled")
+        ways = [(ends, grows) for ends in (*singles, *pairs) for grows in dict.fromkeys(((), growing))]
+        return cls(scene, tuple(axes), tuple(ways), growing)
+
+    def start(self, home: FloatArray) -> FloatArray:
+        """o ``(N, I, 3)`` of each origin; the world's is ``home (3,)``."""
+        first = np.stack([self.scene[ends[0]].position for ends, _ in self.origins])
+        first[[ends[0] is WORLD for ends, _ in self.origins]] += home
+        return first
+
+    def design(self, home: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """X ``(M, N, I, 3, P)`` of all combinations, and the P ridge penalties."""
+        start, scene = self.start(home), self.scene
+        num, demos = start.shape[:2]
+        fixed = np.zeros((num, demos, 3, 7))
+        for index, (origin, _) in enumerate(self.origins):
+            if origin[0].turns and len(origin) == 2:
+                fixed[index, ..., 1:4] = scene[origin[0]].rotation
+            if len(origin) == 2:
+                fixed[index, ..., 0] = scene[origin[1]].position - start[index]
+                if origin[1].turns:
+                    fixed[index, ..., 4:7] = scene[origin[1]].rotation
+            elif origin[0].turns:
+                fixed[index, ..., 4:7] = scene[origin[0]].rotation
+        rotation = self.rotations()
+        sizes = [(scene[thing].size - 1)[:, None, None] * rotation for thing in self.growing]
+        moved = np.repeat(np.concatenate([rotation, *sizes], axis=-1)[:, None], num, axis=1)
+        moved[:, [not grows for _, grows in self.origins], ..., 3:] = 0.0
+        parts = np.broadcast_to(fixed, (len(rotation), *fixed.shape)), moved
+        deviations = [SHARE_STD, *[POINT_STD_M] * 6, *[OFFSET_STD_M] * 3, *[GROWTH_STD_M] * (3 * len(self.growing))]
+        return np.concatenate(parts, axis=-1), (NOISE_M / np.array(deviations)) ** 2
+
+    def rotations(self) -> FloatArray:
+        """``(M, I, 3, 3)``."""
+        return np.stack([axes.rotation(self.scene) for axes in self.axes])
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """What each combination predicts: ``squared (T, M, N, I)``, square metres, is the error of each demonstration from
+    the others, ``penalty (M, N)`` the cost of its fitted numbers, in logarithms of the error."""
+
+    squared: FloatArray
+    penalty: FloatArray
+
+    @property
+    def cost(self) -> FloatArray:
+        """``(T, M, N)``: the mean logarithm of the error, on which a single bad demonstration has little influence."""
+        return 0.5 * np.log(self.squared + NOISE_M**2).mean(axis=-1) + self.penalty
+
+    @property
+    def mean_squared(self) -> FloatArray:
+        """``(T, M, N)``, square metres, raised by the cost: every demonstration has to be explained."""
+        return self.squared.mean(axis=-1) * np.exp(2 * self.penalty)
+
+
+def prediction_errors(candidates: Candidates, hands: FloatArray) -> Errors:
+    """Leave-one-out errors of all ``candidates`` for one arm's ``hands (I, T, 3, 3)`` (three points a step)."""
+    demos = len(hands)
+    centre = hands.mean(axis=2)  # (I, T, 3)
+    home = centre[:, 0].mean(axis=0)
+    start, (design, penalty) = candidates.start(home), candidates.design(home)
+    m, n, _, _, p = design.shape
+    flat = design.reshape(m, n, 3 * demos, p)
+    gram = np.swapaxes(flat, -1, -2) @ flat + np.diag(penalty)
+    hat = flat @ np.linalg.solve(gram, np.swapaxes(flat, -1, -2))
+    offset = (centre[None] - start[:, :, None]).transpose(0, 1, 3, 2)  # (N, I, 3, T)
+    target = offset.reshape(n, 3 * demos, -1)
+    residual = (target - hat @ target).reshape(m, n, demos, 3, -1)
+    if demos >= DEMOS_TO_TELL_THINGS - 1:
+        own = hat.reshape(m, n, demos, 3, demos, 3)[:, :, np.arange(demos), :, np.arange(demos)]  # (I, M, N, 3, 3)
+        own = np.moveaxis(own, 0, 2)
+        residual = np.linalg.solve(np.eye(3) - own, residual)
+    place = np.moveaxis((residual**2).sum(axis=3), -1, 0)  # (T, M, N, I)
+    rotation = candidates.rotations()
+    shape = np.einsum("miyx,itpy->mitpx", rotation, hands - centre[:, :, None])
+    rest = (shape - shape.mean(axis=1, keepdims=True)) * (demos / max(demos - 1, 1))
+    turn = np.moveaxis((rest**2).sum(axis=-1).mean(axis=-1), -1, 0)  # (T, M, I)
+    squared = place + turn[:, :, None]
+    expected = np.zeros((m, n))
+    if demos < DEMOS_TO_TELL_THINGS:
+        squared = squared * (demos > 1) + _guess(candidates, target.reshape(n, demos, 3, -1), demos)
+    else:
+        expected = np.trace(hat, axis1=-2, axis2=-1) + 2 * np.array([[len(axes.ends) - 1] for axes in candidates.axes])
+        expected = expected + np.array([[axes.ends[0].thing is not WORLD] for axes in candidates.axes])
+    return Errors(squared, PARAMETER_COST * expected)
+
+
+def _guess(candidates: Candidates, offset: FloatArray, demos: int) -> FloatArray:
+    """Expected squared error ``(T, M, N, I)`` where demonstrations are too few to tell.
+
+    The keypoints' noise, carried to the hand at ``offset (N, I, 3, T)``, and a share of its distance. A thing is seen
+    in its own axes.
+    """
+    distance = np.linalg.norm(offset, axis=2)  # (N, I, T)
+    noise = np.full(distance.shape, NOISE_M**2)
+    suits = np.zeros((len(candidates.axes), len(candidates.origins)))
+    for index, ((thing, *_), _) in enumerate(candidates.origins):
+        if thing.shape is not None:
+            radius = ((thing.shape - thing.shape.mean(axis=0)) ** 2).sum()
+            noise[index] = NOISE_M**2 * (1 / len(thing.shape) + distance[index] ** 2 / radius)
+        for row, axes in enumerate(candidates.axes):
+            own = axes.ends[0].thing
+            suits[row, index] = 0.0 if own is thing or (own is WORLD and not thing.turns) else np.inf
+    turning = np.array([thing.turns or thing is WORLD for (thing, *_), _ in candidates.origins])
+    share = np.where(turning, DISTANCE_SHARE, UNTURNED_SHARE)[:, None, None]
+    guess = noise + (share * distance / demos) ** 2
+    return np.moveaxis(guess, -1, 0)[:, None] + suits[None, :, :, None]
+
+
+def choose_frames(things: Sequence[Thing], scene: Scene, hands: FloatArray, key_steps: Sequence[int]) -> list[Frame]:
+    """The frame of each step for one arm's ``hands (I, T, 3, 3)``, the gripper's three points in each demonstration.
+
+    Viterbi over the steps: leave-one-out error plus a cost for each change. Where lines suit, the points between which
+    they run are fitted, and all is judged again.
+    """
+    weight = np.ones(hands.shape[1])
+    weight[list(key_steps)] = KEY_STEP_WEIGHT
+    candidates = Candidates.of(things, scene)
+    errors = prediction_errors(candidates, hands)
+    if len(hands) >= DEMOS_TO_TELL_THINGS:
+        candidates = _with_fitted_lines(candidates, errors, hands, weight)
+        errors = prediction_errors(candidates, hands)
+    chosen = _viterbi(errors.cost.reshape(len(weight), -1) * weight[:, None])
+    picks = [np.unravel_index(index, errors.cost.shape[1:]) for index in chosen]
+    return _fitted(candidates, errors, hands, [(int(m), int(n)) for m, n in picks])
+
+
+def _viterbi(cost: FloatArray) -> list[int]:
+    """The sequence of columns of ``cost (T, C)`` with the least sum, where each change costs the same."""
+    total, origin = cost[0], []
+    for own in cost[1:]:
+        best = int(np.argmin(total))
+        stays = total <= total[best] + TRANSITION_COST
+        origin.append(np.where(stays, np.arange(len(total)), best))
+        total = np.minimum(total, total[best] + TRANSITION_COST) + own
+    chosen = [int(np.argmin(total))]
+    for before in reversed(origin):
+        chosen.append(int(before[chosen[-1]]))
+    return chosen[::-1]
+
+
+def _with_fitted_lines(candidates: Candidates, errors: Errors, hands: FloatArray, weight: FloatArray) -> Candidates:
+    """``candidates`` with those lines fitted that suit some step best."""
+    best = errors.cost.reshape(len(weight), -1).argmin(axis=1)
+    picks = np.stack(np.unravel_index(best, errors.cost.shape[1:]), axis=1)
+    axes = list(candidates.axes)
+    for index in np.unique(picks[:, 0]):
+        if len(axes[index].ends) == 2:
+            steps = np.flatnonzero(picks[:, 0] == index)
+            axes[index] = _fitted_line(candidates, int(index), hands[:, steps], picks[steps, 1], weight[steps])
+    return replace(candidates, axes=tuple(axes))
+
+
+def _fitted_line(
+    candidates: Candidates, index: int, hands: FloatArray, origins: FloatArray, weight: FloatArray
+) -> Axes:
+    """Axes ``index`` with the ends between which the line predicts the ``hands (I, T, 3, 3)`` best, each step's origin
+    being one of ``origins (T,)``; by robust least squares, with the other numbers eliminated."""
+    axes = candidates.axes[index]
+    free = [end.thing.turns or end.thing is WORLD for end in axes.ends]
+    width = 3 if axes.in_space else 2
+    centre = hands.mean(axis=2)
+    home = np.zeros(3)
+
+    def moved(x: FloatArray) -> Axes:
+        offsets = iter(x.reshape(-1, width))
+        ends = [
+            Anchor(end.thing, np.pad(next(offsets), (0, 3 - width))) if own else end
+            for end, own in zip(axes.ends, free, strict=True)
+        ]
+        return replace(axes, ends=tuple(ends))
+
+    def residuals(x: FloatArray) -> FloatArray:
+        line = replace(candidates, axes=(moved(x),))
+        rotation = line.rotations()[0]
+        shape = np.einsum("iyx,itpy->tipx", rotation, hands - centre[:, :, None])
+        parts = [(shape - shape.mean(axis=1, keepdims=True)).transpose(1, 2, 3, 0).reshape(-1, len(weight)) * 0.6]
+        start, (design, penalty) = line.start(home), line.design(home)
+        for number, origin in enumerate(origins):
+            flat = design[0, origin].reshape(-1, len(penalty))
+            target = (centre[:, number] - start[origin]).ravel()
+            w = np.linalg.solve(flat.T @ flat + np.diag(penalty), flat.T @ target)
+            parts.append((target - flat @ w)[:, None])
+        return np.concatenate([*(part.ravel() / NOISE_M for part in parts), x / POINT_STD_M])
+
+    fit = least_squares(residuals, np.zeros(width * sum(free)), loss="soft_l1", max_nfev=12)
+    return moved(fit.x)
+
+
+def _fitted(candidates: Candidates, errors: Errors, hands: FloatArray, picks: Sequence[tuple[int, int]]) -> list[Frame]:
+    """The frames of ``picks`` (axes, origin), one a step, with their numbers fitted robustly to the demonstrations."""
+    centre = hands.mean(axis=2)
+    home = centre[:, 0].mean(axis=0)
+    start, (design, penalty) = candidates.start(home), candidates.design(home)
+    frames = []
+    for step, (m, n) in enumerate(picks):
+        (origin, grows), x = candidates.origins[n], design[m, n]
+        target = centre[:, step] - start[n]
+        weight = np.ones(len(hands))
+        for _ in range(5):
+            gram = np.einsum("i,ixa,ixb->ab", weight, x, x) + np.diag(penalty)
+            w = np.linalg.solve(gram, np.einsum("i,ixa,ix->a", weight, x, target))
+            squared = ((x @ w - target) ** 2).sum(axis=1)
+            weight = 1 / (1 + squared / max(float(np.median(squared)), NOISE_M**2) / 3)
+        share = float(w[0]) if len(origin) == 2 else 0.0
+        shifts = [w[1:4], w[4:7]] if len(origin) == 2 else [w[4:7]]
+        if origin[0] is WORLD:
+            shifts[0] = (1 - share) * home
+        grown = w[10:].reshape(-1, 3)
+        growth = tuple(zip(grows, grown, strict=False))
+        error = float(np.sqrt(np.median(errors.squared[step, m, n])))
+        frames.append(Frame(candidates.axes[m], origin, tuple(shifts), share, growth, error))
+    return frames

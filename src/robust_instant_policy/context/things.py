@@ -1,0 +1,338 @@
+"""Things: keypoints that move together, found from how their distances vary over the demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from scipy.cluster.hierarchy import fcluster, linkage, to_tree
+from scipy.optimize import least_squares
+from scipy.spatial.distance import squareform
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.geometry import FloatArray, fit_rigid, fit_upright, rotations_about_vertical
+
+RIGID_SPREADS = 3.5  # keypoints whose distance varies by so many times the smallest variation belong to the same thing,
+RIGID_SPREAD_M = (0.006, 0.015)  # within these limits
+DEMOS_TO_TELL_THINGS = 3  # with fewer, all distances look constant
+DEMOS_FOR_MEDIANS = 5  # with fewer, an outlier cannot be identified
+OUTLIER_M = 0.006  # residual at which a keypoint's influence on a fitted pose is halved
+SHAPE_TOLERANCE = 0.15  # of a thing's size: how far its shape may vary beside its size
+LEAST_SWING_RAD = 0.2  # a part that turns less than this shows no hinge
+LEAST_SCALED = 4  # keypoints of a thing of varying size: two define it
+SIZE_EXPLAINS = 0.7  # relative spread of distances when divided by the size, below which a thing has one
+MAX_THINGS = 4  # of several keypoints: those of the most keypoints
+MAD_TO_STD = 1.4826
+
+Kind = Literal["world", "point", "upright", "rigid", "scaled", "hinged"]
+
+
+@dataclass(frozen=True, eq=False)
+class Hinge:
+    """The axis about which a part turns: a ``point (3,)`` and ``rotation (3, 3)`` in the frame of ``base``, with the
+    axis along the rotation's z. ``share`` of the part's angle is taken: 1 is the part, 0 the base."""
+
+    base: Thing
+    point: FloatArray
+    rotation: FloatArray
+    share: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """Keypoints that move together; its pose can be found in any scene.
+
+    A ``point`` keeps the world's axes. Others turn with the keypoints ``members`` whose positions in the thing are
+    ``shape (N, 3)``: ``upright`` about the vertical, ``rigid`` in all directions, ``scaled`` about the vertical with a
+    size that differs from scene to scene, ``hinged`` about the axis of ``hinge``. The ``world`` has no members.
+    """
+
+    kind: Kind
+    members: tuple[int, ...] = ()
+    shape: FloatArray | None = None
+    hinge: Hinge | None = None
+
+    def __str__(self) -> str:
+        if self.kind == "world":
+            return "the world"
+        names = ("keypoint " if len(self.members) == 1 else "keypoints ") + _ranges(self.members)
+        if self.hinge is None:
+            return names + {"rigid": " (in space)", "scaled": " (of any size)"}.get(self.kind, "")
+        share = "" if self.hinge.share == 1 else f"{self.hinge.share:.0%} of the angle of "
+        return f"{share}{names}, hinged to {self.hinge.base}"
+
+    @property
+    def turns(self) -> bool:
+        return self.kind not in ("world", "point")
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """A thing in I scenes: ``rotation (I, 3, 3)``, ``position (I, 3)`` and relative ``size (I,)``."""
+
+    rotation: FloatArray
+    position: FloatArray
+    size: FloatArray
+
+    def of(self, scenes: np.ndarray) -> Located:
+        """The thing in those of the ``scenes`` alone."""
+        return Located(self.rotation[scenes], self.position[scenes], self.size[scenes])
+
+    def point(self, offset: FloatArray) -> FloatArray:
+        """``(I, 3)``, the world positions of the point ``offset (3,)`` of the thing."""
+        return self.position + self.rotation @ offset
+
+
+WORLD = Thing("world")
+Scene = Mapping[Thing, Located]
+
+
+def locate(things: Iterable[Thing], keypoints: FloatArray) -> dict[Thing, Located]:
+    """Where ``things``, and those that they are hinged to, are in the scenes of ``keypoints (I, K, 3)``."""
+    found: dict[Thing, Located] = {}
+    for thing in things:
+        if thing.hinge is not None and thing.hinge.base not in found:
+            found[thing.hinge.base] = _located(thing.hinge.base, keypoints, found)
+        if thing not in found:
+            found[thing] = _located(thing, keypoints, found)
+    return found
+
+
+def _located(thing: Thing, keypoints: FloatArray, found: Scene) -> Located:
+    count = len(keypoints)
+    still, unit = np.tile(np.eye(3), (count, 1, 1)), np.ones(count)
+    if thing.kind == "world":
+        return Located(still, np.zeros((count, 3)), unit)
+    points = keypoints[:, list(thing.members)]
+    if thing.kind == "point":
+        return Located(still, points[:, 0], unit)
+    assert thing.shape is not None
+    if thing.hinge is not None:
+        hinge, base = thing.hinge, found[thing.hinge.base]
+        axis = base.rotation @ hinge.rotation
+        origin = base.point(hinge.point)
+        turned = _complex((points - origin[:, None]) @ axis)
+        angle = np.angle((np.conj(_complex(thing.shape)) * turned).sum(axis=1))
+        return Located(axis @ rotations_about_vertical(hinge.share * angle), origin, unit)
+    if thing.kind == "scaled":
+        middle = points.mean(axis=1)
+        ratio = (np.conj(_complex(thing.shape)) * _complex(points - middle[:, None])).sum(axis=1)
+        ratio = ratio / (np.abs(_complex(thing.shape)) ** 2).sum()
+        return Located(rotations_about_vertical(np.angle(ratio)), middle, np.abs(ratio))
+    poses = robust_fit(thing.shape, points, upright=thing.kind == "upright")
+    return Located(poses[:, :3, :3], poses[:, :3, 3], unit)
+
+
+def find_things(keypoints: FloatArray) -> list[Thing]:
+    """What demonstrations with ``keypoints (I, K, 3)`` consist of: things of several keypoints, then loose points.
+
+    Keypoints belong together when their distances are nearly the same in all demonstrations, or keep their ratios. With
+    too few demonstrations to tell, every group of neighbours may be a thing.
+    """
+    num_demos, num_points = keypoints.shape[:2]
+    if num_points == 1:
+        return [Thing("point", (0,))]
+    distances = np.linalg.norm(keypoints[:, :, None] - keypoints[:, None], axis=-1)
+    if num_demos < DEMOS_TO_TELL_THINGS:
+        tree = linkage(squareform(np.median(distances, axis=0), checks=False), "average")
+        nodes = to_tree(tree, rd=True)[1]
+        groups = [tuple(sorted(node.pre_order())) for node in nodes if not node.is_leaf()]
+        return [*_solid(groups, keypoints), *(Thing("point", (k,)) for k in range(num_points))]
+    varies = spread(distances)
+    least = np.median(np.where(np.eye(num_points, dtype=bool), np.inf, varies).min(axis=1))
+    tolerance = float(np.clip(RIGID_SPREADS * least, *RIGID_SPREAD_M))
+    clusters = _clusters(varies, tolerance)
+    scaled = [thing for thing in _scaled(keypoints, tolerance) if _outnumbers(thing.members, clusters)]
+    taken = {member for thing in scaled for member in thing.members}
+    groups = [group for group in clusters if len(group) > 1 and taken.isdisjoint(group)]
+    things = _solid(sorted(groups, key=lambda group: -len(group))[:MAX_THINGS], keypoints) + scaled
+    things += _hinged(things, keypoints, tolerance)
+    known = {member for thing in things if thing.kind != "scaled" for member in thing.members}
+    return things + [Thing("point", (k,)) for k in range(num_points) if k not in known]
+
+
+def _clusters(varies: FloatArray, tolerance: float) -> list[tuple[int, ...]]:
+    """Groups of keypoints all of whose distances vary less than ``tolerance``."""
+    labels = fcluster(linkage(squareform(varies, checks=False), "complete"), tolerance, "distance")
+    return [tuple(map(int, np.flatnonzero(labels == label))) for label in np.unique(labels)]
+
+
+def _outnumbers(members: tuple[int, ...], clusters: Sequence[tuple[int, ...]]) -> bool:
+    """Whether more keypoints keep their shape than their distances, those that keep their distances among them."""
+    return all(set(cluster) < set(members) for cluster in clusters if not set(cluster).isdisjoint(members))
+
+
+def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray) -> list[Thing]:
+    things = [Thing("upright", group, _mean_shape(keypoints[:, list(group)], True)) for group in groups]
+    flat = [group for group in groups if len(group) >= 3]
+    return things + [Thing("rigid", group, _mean_shape(keypoints[:, list(group)], False)) for group in flat]
+
+
+def _scaled(keypoints: FloatArray, tolerance: float) -> list[Thing]:
+    """Things that keep their shape, seen from above, but not their size.
+
+    Two keypoints define a position, a turn and a size; others belong to them where these predict where they are.
+    """
+    things: list[Thing] = []
+    loose = list(range(keypoints.shape[1]))
+    while len(loose) >= LEAST_SCALED:
+        z = _complex(keypoints[:, loose])
+        apart = z[:, None, :] - z[:, :, None]  # from j to k
+        length = np.abs(apart).mean(axis=0)
+        relative = (z[:, None, None, :] - z[:, :, None, None]) / (apart + np.eye(len(loose)))[..., None]
+        scatter = np.hypot(spread(relative.real), spread(relative.imag)) * length[..., None]  # (j, k, member)
+        near = np.minimum(length[:, None], length[None])  # of a member to j or k
+        fits = scatter < np.maximum(SHAPE_TOLERANCE * near, tolerance)
+        fits[np.eye(len(loose), dtype=bool)] = False
+        count = fits.sum(axis=-1) - (scatter * fits).sum(axis=-1)
+        j, k = np.unravel_index(int(np.argmax(count)), count.shape)
+        members = tuple(loose[index] for index in np.flatnonzero(fits[j, k]))
+        if len(members) < LEAST_SCALED:
+            break
+        loose = [k for k in loose if k not in members]
+        points = keypoints[:, list(members)]
+        size = _rms_radius(points)
+        distances = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
+        relative = distances * (size.mean() / size)[:, None, None]
+        if spread(relative).sum() < SIZE_EXPLAINS * spread(distances).sum():
+            unit = points * (size.mean() / size)[:, None, None]
+            things.append(Thing("scaled", members, _mean_shape(unit, True)))
+    return things
+
+
+def _rms_radius(points: FloatArray) -> FloatArray:
+    flat = points[..., :2] - points[..., :2].mean(axis=1, keepdims=True)
+    return np.sqrt((flat**2).sum(axis=-1).mean(axis=-1))
+
+
+def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) -> list[Thing]:
+    """Rigid things that turn about an axis fixed in another one or in the world, at shares of their angle."""
+    rigid = {thing.members: thing for thing in things if thing.kind == "rigid"}
+    bases = [WORLD, *(thing for thing in things if thing.kind in ("upright", "rigid"))]
+    found = locate([*bases, *rigid.values()], keypoints)
+    hinged: list[Thing] = []
+    for members, part in rigid.items():
+        fits = [
+            (error, hinge, shape)
+            for base in bases
+            if base.members != members
+            for error, hinge, shape in _hinge(base, found[base], found[part], keypoints[:, list(members)])
+            if error < tolerance
+        ]
+        if fits:
+            _, hinge, shape = min(fits, key=lambda fit: fit[0])
+            for share in (1.0, 0.25, 0.5, 0.75):
+                hinged.append(Thing("hinged", members, shape, Hinge(hinge.base, hinge.point, hinge.rotation, share)))
+    return hinged
+
+
+def _hinge(
+    base: Thing, base_at: Located, part_at: Located, points: FloatArray
+) -> list[tuple[float, Hinge, FloatArray]]:
+    """The part's error (metres) as a part of ``base``, the hinge, and its shape about it; none where nothing swings.
+
+    Relative rotations about one axis have parallel rotation vectors, and their fixed points lie on the axis: a first
+    guess, which is then fitted to the part's ``points (I, N, 3)``.
+    """
+    back = np.swapaxes(base_at.rotation, -1, -2)
+    rotation = back @ part_at.rotation
+    position = (back @ (part_at.position - base_at.position)[..., None])[..., 0]
+    middle = Rotation.from_matrix(rotation).mean().as_matrix()
+    swings = Rotation.from_matrix(rotation @ middle.T).as_rotvec()
+    axis = np.linalg.svd(swings)[2][0]
+    if np.ptp(swings @ axis) < LEAST_SWING_RAD:
+        return []
+    turn = Rotation.from_rotvec(np.outer(swings @ axis, axis)).as_matrix()
+    # t_i = c + turn_i (t - c): linear in c and t
+    system = np.concatenate([np.eye(3) - turn, turn], axis=2).reshape(-1, 6)
+    center = np.linalg.lstsq(system, position.ravel(), rcond=1e-2)[0][:3]
+    frame = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])[0]
+    local = (points - base_at.position[:, None]) @ base_at.rotation
+
+    def residuals(x: FloatArray) -> FloatArray:
+        seen, turned = _about_axis(local, center + x[3:], (frame * Rotation.from_rotvec(x[:3])).as_matrix())
+        return np.append(((seen - turned) / OUTLIER_M).ravel(), 0.01 * x)  # turning or moving along the axis is free
+
+    x = least_squares(residuals, np.zeros(6), loss="soft_l1", max_nfev=20).x
+    hinge = Hinge(base, center + x[3:], (frame * Rotation.from_rotvec(x[:3])).as_matrix())
+    seen, turned = _about_axis(local, hinge.point, hinge.rotation)
+    error = float(np.sqrt(np.median(_squared(seen - turned))))
+    return [(error, hinge, turned[0])]
+
+
+def _about_axis(local: FloatArray, point: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``local (I, N, 3)`` in the axes of a hinge, and the same for a rigid part that turns about its z."""
+    seen = (local - point) @ rotation
+    shape = seen[0]
+    for _ in range(2):
+        angle = np.angle((np.conj(_complex(shape)) * _complex(seen)).sum(axis=1))
+        shape = (seen @ rotations_about_vertical(angle)).mean(axis=0)
+    turned = shape @ np.swapaxes(rotations_about_vertical(angle), -1, -2)
+    return seen, turned
+
+
+def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArray:
+    """Poses ``(I, 4, 4)`` that map ``shape (N, 3)`` onto ``points (I, N, 3)``, robust to a minority of outliers.
+
+    The best of all minimal subsets, refined by iteratively reweighted least squares.
+    """
+    size = 2 if upright else 3
+    fit = fit_upright if upright else fit_rigid
+    if len(shape) <= size:
+        return fit(np.broadcast_to(shape, points.shape), points, np.ones(points.shape[:2]))
+    subsets = np.array(list(combinations(range(len(shape)), size)))
+    starts = fit(shape[subsets], points[:, subsets], np.ones((len(points), *subsets.shape)))  # (I, subsets, 4, 4)
+    loss = _squared(_moved(starts, shape) - points[:, None])
+    best = np.argmin((loss / (loss + OUTLIER_M**2)).sum(axis=-1), axis=1)
+    pose = starts[np.arange(len(points)), best]
+    for _ in range(5):
+        residual = _squared(_moved(pose, shape) - points)
+        pose = fit(np.broadcast_to(shape, points.shape), points, 1 / (1 + residual / OUTLIER_M**2) ** 2)
+    return pose
+
+
+def spread(values: FloatArray) -> FloatArray:
+    """Standard deviation over the first axis; from `DEMOS_FOR_MEDIANS` values on from the median absolute deviation."""
+    if len(values) < DEMOS_FOR_MEDIANS:
+        return values.std(axis=0)
+    return MAD_TO_STD * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
+
+
+def _mean_shape(points: FloatArray, upright: bool) -> FloatArray:
+    """The centred shape ``(N, 3)`` of which ``points (I, N, 3)`` are noisy, moved copies."""
+    distances = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
+    typical = int(np.argmin(np.abs(distances - np.median(distances, axis=0)).sum(axis=(1, 2))))
+    shape = points[typical] - points[typical].mean(axis=0)
+    for _ in range(2):
+        poses = robust_fit(shape, points, upright)
+        back = (points - poses[:, None, :3, 3]) @ poses[:, :3, :3]
+        shape = np.median(back, axis=0)
+        shape = shape - shape.mean(axis=0)
+    return shape
+
+
+def _moved(poses: FloatArray, points: FloatArray) -> FloatArray:
+    return points @ np.swapaxes(poses[..., :3, :3], -1, -2) + poses[..., None, :3, 3]
+
+
+def _squared(vectors: FloatArray) -> FloatArray:
+    return (vectors**2).sum(axis=-1)
+
+
+def _complex(points: FloatArray) -> np.ndarray:
+    """x + iy: turns and sizes seen from above are complex factors."""
+    return points[..., 0] + 1j * points[..., 1]
+
+
+def _ranges(members: Sequence[int]) -> str:
+    """ "0-4, 7" for 0, 1, 2, 3, 4, 7."""
+    runs: list[list[int]] = []
+    for member in members:
+        if runs and member == runs[-1][-1] + 1:
+            runs[-1].append(member)
+        else:
+            runs.append([member])
+    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)

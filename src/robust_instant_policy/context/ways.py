@@ -1,0 +1,234 @@
+"""Demonstrations that do different things in different scenes: what decides, and which way a new scene goes.
+
+Two kinds of decisions are told apart. Where things are alike, one of them may be meant by its *rank*: the nearest, the
+second from the left. Keypoints are then renamed, so that the first thing is the first in order, and all demonstrations
+do the same again. Else the demonstrations may be *split* in two by a threshold on one measure of the scene. Either is
+believed where the demonstrations then predict each other better at the key steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations, pairwise, permutations
+from operator import attrgetter
+
+import numpy as np
+
+from robust_instant_policy.context.choice import NOISE_M, Candidates, prediction_errors
+from robust_instant_policy.context.things import WORLD, Located, Scene, Thing, find_things, locate
+from robust_instant_policy.geometry import FloatArray, fit_upright
+
+RANK_GAIN, SPLIT_GAIN = 1.0, 1.0  # sums of logarithms of the errors at key steps by which an explanation must be better
+LEAST_OF_A_WAY = 2  # demonstrations
+ALIKE_M = 0.006  # largest difference of the shapes of things that are alike
+SINGLE_ERROR_M = 0.018  # where every key step is predicted better than this, all do the same
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """One number of a scene, in ``words``: a function of where some ``things`` are, to ``(I,)``."""
+
+    words: str
+    things: tuple[Thing, ...]
+    function: Callable[..., FloatArray]
+
+    def value(self, scene: Scene) -> FloatArray:
+        return self.function(*(scene[thing] for thing in self.things))
+
+    def value_at(self, keypoints: FloatArray) -> float:
+        """In the scene of ``keypoints (K, 3)``."""
+        return float(self.value(locate(self.things, keypoints[None]))[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Order:
+    """Things alike, sorted: ``blocks`` are their keypoints, in the same order in each, ``axis`` what sorts them."""
+
+    blocks: tuple[tuple[int, ...], ...]
+    axis: int
+
+    def __str__(self) -> str:
+        by = ("x", "y", "z", "distance from the robot")[self.axis]
+        return f"the {len(self.blocks)} things alike are told apart by their {by}"
+
+    def renamed(self, keypoints: FloatArray) -> FloatArray:
+        """``keypoints (I, K, 3)`` with those of the first thing in order first."""
+        blocks = np.array(self.blocks)
+        middle = np.median(keypoints[:, blocks], axis=2)  # (I, B, 3)
+        values = np.concatenate([middle, np.linalg.norm(middle[..., :2], axis=-1, keepdims=True)], axis=-1)
+        order = np.argsort(values[..., self.axis], axis=1)
+        sorted_ = keypoints.copy()
+        sorted_[:, blocks.ravel()] = keypoints[
+            np.arange(len(keypoints))[:, None], blocks[order].reshape(len(order), -1)
+        ]
+        return sorted_
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Two ways to act: the first where the ``measure`` is below ``threshold``. ``gap`` is the distance between the
+    nearest demonstrations on both sides."""
+
+    measure: Measure
+    threshold: float
+    gap: float
+
+    def __str__(self) -> str:
+        return f"two ways, told apart by {self.measure.words} (threshold {self.threshold:.3f})"
+
+    def decide(self, keypoints: FloatArray) -> tuple[int, float]:
+        """The way for ``keypoints (K, 3)``, 0 or 1, and the vote in [0, 1]: 1 is as clear as the demonstrations are."""
+        beyond = self.measure.value_at(keypoints) - self.threshold
+        return int(beyond >= 0), float(min(1.0, abs(beyond) / (self.gap / 2)))
+
+
+def find_order(keypoints: FloatArray, hands: FloatArray) -> Order | None:
+    """The order by which things alike are meant in demonstrations with ``keypoints (I, K, 3)`` and ``hands (I, T, A, 3,
+    3)`` at the key steps; None where their names are as good."""
+    blocks = _alike(find_things(keypoints), keypoints)
+    if not blocks:
+        return None
+    orders = [None, *(Order(blocks, axis) for axis in (3, 1, 0, 2))]
+    costs = []
+    for order in orders:
+        named = order.renamed(keypoints) if order else keypoints
+        things = find_things(named)
+        costs.append(_cost(_squared(things, locate([WORLD, *things], named), hands)) + RANK_GAIN * bool(order))
+    return orders[int(np.argmin(costs))]
+
+
+def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tuple[Split, np.ndarray] | None:
+    """What parts demonstrations in ``scene`` with ``hands (I, T, A, 3, 3)`` at the key steps, and which side ``(I,)``
+    each is on (True: the second); None where one way explains them as well."""
+    demos = len(hands)
+    single = _squared(things, scene, hands)
+    if demos < 2 * LEAST_OF_A_WAY or single.max() < SINGLE_ERROR_M**2:
+        return None
+    splits: dict[bytes, list[tuple[float, Split, np.ndarray]]] = {}
+    for measure in _measures(things):
+        values = measure.value(scene)
+        ordered = np.sort(values)[LEAST_OF_A_WAY - 1 : demos - LEAST_OF_A_WAY + 1]
+        for low, high in pairwise(ordered):
+            gap, deviation = float(high - low), float(values.std())
+            if min(gap, deviation / 4) > NOISE_M:
+                side = values > (low + high) / 2
+                key = (side if side[0] else ~side).tobytes()
+                split = Split(measure, float(low + high) / 2, gap)
+                margin = gap / deviation / np.sqrt(len(measure.things))
+                splits.setdefault(key, []).append((margin, split, side))
+    best: tuple[float, Split, np.ndarray] | None = None
+    for same in splits.values():
+        margin, split, side = max(same, key=lambda one: one[0])
+        squared = np.zeros_like(single)
+        for part in (~side, side):
+            own = {thing: located.of(part) for thing, located in scene.items()}
+            squared += part.mean() * _squared(things, own, hands[part])
+        cost = _cost(squared) - min(margin, 1.0)
+        if squared.max() < single.max() / 4 and (best is None or cost < best[0]):
+            best = cost, split, side
+    return (best[1], best[2]) if best is not None and best[0] + SPLIT_GAIN < _cost(single) else None
+
+
+def _squared(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> FloatArray:
+    """Mean squared error ``(A, T)``, square metres, of a demonstration predicted from the others in the best frames."""
+    candidates = Candidates.of(things, scene)
+    arms = [prediction_errors(candidates, hands[:, :, arm]).mean_squared for arm in range(hands.shape[2])]
+    return np.stack([errors.min(axis=(1, 2)) for errors in arms])
+
+
+def _cost(squared: FloatArray) -> float:
+    return 0.5 * float(np.log(squared + NOISE_M**2).sum())
+
+
+def _alike(things: Sequence[Thing], keypoints: FloatArray) -> tuple[tuple[int, ...], ...]:
+    """The most things of the same shape, keypoints in corresponding order; none where fewer than two are alike."""
+    solid = [thing for thing in things if thing.kind == "upright" and thing.shape is not None]
+    best: tuple[tuple[int, ...], ...] = ()
+    for first in solid:
+        blocks = [first.members]
+        for other in solid:
+            if other is not first and len(other.members) == len(first.members) <= 6:
+                match = _matched(first.shape, other.shape)
+                if match is not None:
+                    blocks.append(tuple(other.members[index] for index in match))
+        if len(blocks) > max(len(best), 1):
+            best = tuple(blocks)
+    return best
+
+
+def _matched(shape: FloatArray | None, other: FloatArray | None) -> tuple[int, ...] | None:
+    """The order of the ``other (N, 3)`` keypoints in which they have the ``shape (N, 3)``."""
+    assert shape is not None
+    assert other is not None
+    orders = np.array(list(permutations(range(len(shape)))))
+    moved = other[orders]  # (orders, N, 3)
+    poses = fit_upright(moved, np.broadcast_to(shape, moved.shape), np.ones(moved.shape[:2]))
+    fitted = moved @ np.swapaxes(poses[:, :3, :3], -1, -2) + poses[:, None, :3, 3]
+    difference = np.linalg.norm(fitted - shape, axis=-1).max(axis=1)
+    best = int(np.argmin(difference))
+    return tuple(map(int, orders[best])) if difference[best] < ALIKE_M else None
+
+
+def _measures(things: Sequence[Thing]) -> list[Measure]:
+    """What may decide: where things are, how they are turned, their size, and how two or three lie to each other."""
+    own = [thing for thing in things if thing.kind in ("upright", "scaled")]
+    taken = {member for thing in own for member in thing.members}
+    points = [thing for thing in things if thing.kind == "point" and taken.isdisjoint(thing.members)]
+    own += points if len(own) + len(points) <= 4 else []
+    found: list[Measure] = []
+    for a in own:
+        found += [Measure(f"{name} of {a}", (a,), place) for name, place in _PLACES.items()]
+        if a.turns:
+            found.append(Measure(f"the turn of {a}", (a,), _yaw))
+        if a.kind == "scaled":
+            found.append(Measure(f"the size of {a}", (a,), attrgetter("size")))
+    for a, b in combinations(own, 2):
+        found += [
+            Measure(f"{name} of {a} minus that of {b}", (a, b), partial(_difference, place))
+            for name, place in _PLACES.items()
+        ]
+    for a, b in permutations(own, 2):
+        if a.turns:
+            found.append(Measure(f"how far {b} is along the x axis of {a}", (a, b), _ahead))
+            found.append(Measure(f"how far {b} is along the y axis of {a}", (a, b), _aside))
+    for parts in combinations(own, 3):
+        words = "the side of the line from {} to {} on which {} is".format(*parts)
+        found.append(Measure(words, parts, _side))
+    return found
+
+
+def _difference(place: Callable[[Located], FloatArray], at: Located, other: Located) -> FloatArray:
+    return place(at) - place(other)
+
+
+def _far(at: Located) -> FloatArray:
+    return np.linalg.norm(at.position[:, :2], axis=1)
+
+
+def _yaw(at: Located) -> FloatArray:
+    """Angle about the vertical, radians, of the thing's x axis."""
+    return np.arctan2(at.rotation[:, 1, 0], at.rotation[:, 0, 0])
+
+
+def _ahead(at: Located, other: Located) -> FloatArray:
+    return ((other.position - at.position) * at.rotation[:, :, 0]).sum(axis=1)
+
+
+def _aside(at: Located, other: Located) -> FloatArray:
+    return ((other.position - at.position) * at.rotation[:, :, 1]).sum(axis=1)
+
+
+def _side(a: Located, b: Located, c: Located) -> FloatArray:
+    """Distance of c from the line from a to b, positive on its left."""
+    line, off = (b.position - a.position)[:, :2], (c.position - a.position)[:, :2]
+    return (line[:, 0] * off[:, 1] - line[:, 1] * off[:, 0]) / np.linalg.norm(line, axis=1)
+
+
+_PLACES: dict[str, Callable[[Located], FloatArray]] = {
+    "x": lambda at: at.position[:, 0],
+    "y": lambda at: at.position[:, 1],
+    "z": lambda at: at.position[:, 2],
+    "the distance from the robot": _far,
+}

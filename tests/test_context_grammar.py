@@ -1,0 +1,109 @@
+"""Frames and ways that are inferred from demonstrations of relations."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robust_instant_policy.context import Prompt, write_prompt
+from robust_instant_policy.policies import Neighbours, context_of_keypoints, scene_of_keypoints
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+from relation_families import FAMILIES
+from relations import key_error
+
+WITHIN_M = 0.015
+
+
+def shown(family: str, count: int = 10, noise: float = 0.002):
+    """Demonstrations of a family: keypoints, trajectories, and what draws more scenes."""
+    draw = FAMILIES[family].scenes("tune", 7, noise)
+    scenes = [draw(number) for number in range(count)]
+    return np.stack([scene.keypoints for scene in scenes]), [scene.trajectory for scene in scenes], draw
+
+
+def errors(prompt: Prompt, draw, count: int = 6) -> np.ndarray:
+    """Of the demonstrations' median at the key steps of new scenes, metres."""
+    found = []
+    for number in range(1000, 1000 + count):
+        scene = draw(number, exact=True)
+        planned = prompt.for_scene(scene.keypoints).median_trajectory(scene.keypoints)
+        found.append(key_error(planned, scene.path))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    ("family", "words"),
+    [
+        ("push-to", "along the line from"),
+        ("point-to", "along the line from"),
+        ("along", "of any size"),
+        ("lid", "hinged to"),
+        ("place", "axes of keypoints"),
+    ],
+)
+def test_a_relation_is_inferred_carried_over_and_told_in_words(family, words):
+    keypoints, trajectories, draw = shown(family)
+    prompt = write_prompt(keypoints, trajectories)
+    assert any(words in str(frame) for frame in prompt.frames.used)
+    assert (errors(prompt, draw) < WITHIN_M).mean() > 0.8
+    assert prompt.ways == (prompt,)
+
+
+@pytest.mark.parametrize("family", ["nearest", "side"])
+def test_demonstrations_that_do_different_things_are_told_apart(family):
+    keypoints, trajectories, draw = shown(family)
+    prompt = write_prompt(keypoints, trajectories)
+    assert (errors(prompt, draw) < WITHIN_M).mean() > 0.8
+    assert "told apart by" in " ".join(prompt.notes())
+
+
+def test_between_two_ways_one_is_followed_whole_and_a_note_says_so():
+    keypoints, trajectories, draw = shown("side")
+    policy = Neighbours()
+    policy.fit_context(context_of_keypoints(keypoints, trajectories, policy.settings))
+    clear = draw(1000, exact=True).keypoints
+    between = clear.copy()
+    between[:5, 1] -= policy.context_.prompt.split.measure.value_at(clear) - policy.context_.prompt.split.threshold
+    notes = {
+        name: policy.plan_scene(scene_of_keypoints(k)).notes for name, k in (("clear", clear), ("between", between))
+    }
+    assert not any("lies between" in note for note in notes["clear"])
+    assert any("lies between" in note for note in notes["between"])
+    ways = policy.context_.prompt.ways
+    plan = policy.plan_scene(scene_of_keypoints(between)).trajectory
+    apart = [
+        np.abs(way.median_trajectory(between).triplets[len(plan) // 2] - plan.triplets[len(plan) // 2]).max()
+        for way in ways
+    ]
+    assert min(apart) < 0.02 < max(apart)
+
+
+def test_each_way_shows_a_model_its_own_demonstrations():
+    keypoints, trajectories, _ = shown("side")
+    prompt = write_prompt(keypoints, trajectories)
+    first, second = prompt.ways
+    assert sorted(first.shown + second.shown) == list(range(10))
+    for way in prompt.ways:
+        assert prompt.for_scene(keypoints[way.shown[0]]) is way
+
+
+def test_one_demonstration_is_said_to_be_a_guess():
+    keypoints, trajectories, _ = shown("place", 1)
+    assert any("guess" in note for note in write_prompt(keypoints, trajectories).notes())
+    keypoints, trajectories, _ = shown("place", 4)
+    assert not any("guess" in note for note in write_prompt(keypoints, trajectories).notes())
+
+
+def test_a_scene_that_stretches_what_was_shown_is_outside():
+    keypoints, trajectories, _ = shown("push-to")
+    prompt = write_prompt(keypoints, trajectories)
+    far = keypoints[0].copy()
+    far[5:, 0] += 0.6
+    assert prompt.outside(keypoints[0]) == 0
+    assert prompt.outside(far) > 0.5
+    assert prompt.predicted_error < 0.05
