@@ -1,6 +1,7 @@
 """Accuracy, processor time and memory of the keypoints.
 
     python benchmarks/perception.py accuracy             # against the simulator's truth, all tasks
+    python benchmarks/perception.py real DIR --out OUT   # photographs with outlines, see perception_real.py
     python benchmarks/perception.py picture              # docs/images/keypoints.jpg
     python benchmarks/perception.py speed                # ratios to one pass of the network
     python benchmarks/perception.py speed --reference CHECKOUT    # beside ShirAmir/dino-vit-features
@@ -29,6 +30,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from dino_reference import ReferenceTransformer, load_reference, random_checkpoint
+from perception_real import real
 from PIL import Image, ImageDraw
 
 from robust_instant_policy.demonstration import Observation
@@ -43,7 +45,7 @@ from robust_instant_policy.perception import (
 from robust_instant_policy.perception.accuracy import Accuracy
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.efficientnet import load_network
-from robust_instant_policy.perception.objects import register
+from robust_instant_policy.perception.objects import register_all
 from robust_instant_policy.perception.settings import DescriptorSettings
 from robust_instant_policy.perception.view import make_view
 from robust_instant_policy.perception.vit import VitDescriptors
@@ -195,7 +197,7 @@ def measure_speed(features: str, settings: DescriptorSettings, shape: tuple[int,
         "locate": lambda: extractor.locate(images[-1]),
         "describe": lambda: extractor.network_.describe(images[-1].rgb),
         "segment": lambda: make_view(images[-1], extractor.network_),
-        "register": lambda: [register(thing.templates, view) for thing in extractor.objects_],
+        "register": lambda: register_all([thing.model for thing in extractor.objects_], view),
     }
     if features == "efficientnet":
         work["fit"] = lambda: extractor.fit(images[:DEMONSTRATIONS])
@@ -276,6 +278,12 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("accuracy").add_argument("--tasks", nargs="*", default=list(TASK_NAMES))
     commands.add_parser("picture").add_argument("--task", default="open-drawer")
+    photographs = commands.add_parser("real")
+    photographs.add_argument("folder", type=Path)
+    photographs.add_argument("--out", type=Path, help="folder of the pictures (default: a new temporary one)")
+    photographs.add_argument("--features", default="auto")
+    photographs.add_argument("--keypoints", type=int, default=10)
+    photographs.add_argument("--tilt", type=float, default=0.0, help="degrees by which the camera's pose is wrong")
     quick = commands.add_parser("speed")
     quick.add_argument("--reference", type=Path)
     quick.add_argument("--features", nargs="+", choices=list(ROUNDS), default=list(ROUNDS))
@@ -286,6 +294,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.command == "accuracy":
         accuracy([name for name in arguments.tasks if not name.startswith("aloha")])
+    elif arguments.command == "real":
+        out = arguments.out or Path(tempfile.mkdtemp(prefix="keypoints-"))
+        real(arguments.folder, out, arguments.features, arguments.keypoints, arguments.tilt)
     elif arguments.command == "picture":
         picture(arguments.task)
     elif arguments.command == "speed":

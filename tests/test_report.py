@@ -198,7 +198,9 @@ def test_words_of_an_evaluation_stay_words(tmp_path):
     variant = Variant("rip", model="<i>model</i>")
     row = Episode(Scene("push-cube", "seen", 1), variant, 0, 1, False, 1.0, 1.0, 1.0, 5, 0.5, "<b>slipped</b>")
     table = Table(("<u>head</u>", "`<s>`"), (("**<em>** </td>", "\\*"),), "<p>")
-    page = Page(evaluation_page(tmp_path, [Section("table1", (), b"<svg/>", [table])], {}, [row], [], table, table))
+    page = Page(
+        evaluation_page(tmp_path, [Section("table1", "paper", "", (), b"<svg/>", [table])], {}, [row], [], table, table)
+    )
     for words in ("<b>slipped</b>", "<u>head</u>", "<em> </td>", "<s>", "not examined"):
         assert words in page.text
     assert not {"i", "u", "em", "s"} & {tag for tag, _ in page.seen}

@@ -123,6 +123,7 @@ def test_quaternions_read_in_the_wrong_order_are_named(demonstrations):
         ("black:scene", "colour"),
         ("bgr:scene", "red and blue are exchanged"),
         ("depth-other-lens:scene", "another lens"),
+        ("cropped-3%:scene", "one was cropped"),
     ],
 )
 def test_a_scene_that_contradicts_the_demonstrations_is_refused_and_the_mistake_is_named(

@@ -13,7 +13,10 @@ STEADY_NEIGHBOURS = 3
 
 ON_TABLE_M = 0.006  # points this near to a plane speak for it
 SAMPLED_POINTS = 1500
-SAMPLED_PLANES = 60
+SAMPLED_PLANES = 200
+MAX_LEVELS = 3  # horizontal planes that are compared with the largest one
+MIN_LEVEL_SHARE = 0.2  # of the largest plane's points, for another one to be the table
+TALLEST_OBJECT_M = 0.45  # whose top may be a plane above the table
 LEVEL = 0.9  # upward part of a unit normal from which a plane counts as horizontal
 
 
@@ -40,17 +43,43 @@ def steady(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def table_plane(points: FloatArray, seed: int) -> FloatArray:
-    """Plane ``(4,)`` (unit normal, upward; offset) that holds most of ``points (N, 3)`` and is nearly horizontal."""
+    """Plane ``(4,)`` (unit normal, upward; offset) of the table in ``points (N, 3)``.
+
+    Of the nearly horizontal planes with many points: the floor lies far under a table, the top of an object little
+    above it. So a higher plane replaces a lower one if it is more than `TALLEST_OBJECT_M` above it.
+    """
     rng = np.random.default_rng(seed)
     points = points[rng.choice(len(points), min(len(points), SAMPLED_POINTS), replace=False)]
+    table = _largest_plane(points, rng)
+    rest, found = points, int((_distances(table, points) < ON_TABLE_M).sum())
+    plane = table
+    for _ in range(MAX_LEVELS):
+        rest = rest[_distances(plane, rest) >= ON_TABLE_M]
+        if len(rest) < MIN_LEVEL_SHARE * found:
+            break
+        plane = _largest_plane(rest, rng)
+        near = rest[_distances(plane, rest) < ON_TABLE_M]
+        if len(near) < MIN_LEVEL_SHARE * found:
+            break
+        if np.median(near @ table[:3] + table[3]) > TALLEST_OBJECT_M:
+            table = plane
+    return table
+
+
+def _distances(plane: FloatArray, points: FloatArray) -> FloatArray:
+    return np.abs(points @ plane[:3] + plane[3])
+
+
+def _largest_plane(points: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """The nearly horizontal plane ``(4,)`` that holds most of ``points (N, 3)``."""
     corners = points[rng.integers(len(points), size=(SAMPLED_PLANES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
-    normals = normals[(level := np.abs(normals[:, 2]) > LEVEL * lengths) & (lengths > 0)]
-    if len(normals) == 0:
+    level = (np.abs(normals[:, 2]) > LEVEL * lengths) & (lengths > 0)
+    if not level.any():
         return np.array([0.0, 0.0, 1.0, -np.median(points[:, 2])])
-    normals /= (np.sign(normals[:, 2]) * np.linalg.norm(normals, axis=1))[:, None]
-    offsets = -(normals * corners[level & (lengths > 0), 0]).sum(axis=1)
+    normals = normals[level] / (np.sign(normals[level, 2]) * lengths[level])[:, None]
+    offsets = -(normals * corners[level, 0]).sum(axis=1)
     near = np.abs(points @ normals.T + offsets) < ON_TABLE_M
     inliers = points[near[:, near.sum(axis=0).argmax()]]
     centre = inliers.mean(axis=0)

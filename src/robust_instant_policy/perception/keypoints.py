@@ -15,15 +15,25 @@ from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
-from robust_instant_policy.perception.objects import Registration, RigidObject, find_objects, register
+from robust_instant_policy.perception.objects import (
+    MIN_FITNESS,
+    Registration,
+    RigidObject,
+    find_objects,
+    register_all,
+    segmentation,
+    without,
+)
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
+from robust_instant_policy.perception.relevance import MIN_RELEVANCE, relevances, shares, still
 from robust_instant_policy.perception.selection import select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
 from robust_instant_policy.perception.view import View, make_view
+from robust_instant_policy.trajectory import Trajectory
 
 CORRESPONDENCES = ("registration", "nearest")
-MIN_FITNESS = 0.15  # of an object's registration in every demonstration
 SAME_SHAPE_FITNESS = 0.7  # from which keypoints need no registration of their own
+SCENERY_WEIGHT = 0.2  # of what never moves, beside what does
 NEIGHBOURHOOD_M = 0.04  # around a keypoint, for a registration of its own
 
 
@@ -48,7 +58,8 @@ class KeypointExtractor:
     `perception.nearest`), which uses no workspace. Deterministic for a ``seed``.
 
     After `fit`: ``keypoints_ (I, K, 3)`` metres, world, and ``pixels_ (I, K, 2)`` (u, v) of I demonstrations;
-    ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``notes_`` for the user, one line each.
+    ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``object_of_ (K,)``, the number of each
+    keypoint's; ``segmentations_``, see `segmentation`; ``notes_`` for the user, one line each.
     """
 
     def __init__(
@@ -72,10 +83,14 @@ class KeypointExtractor:
         self.correspondence = correspondence
         self._shared: SharedDescriptors | None = None
 
-    def fit(self, observations: Sequence[Observation]) -> KeypointExtractor:
+    def fit(
+        self, observations: Sequence[Observation], trajectories: Sequence[Trajectory] | None = None
+    ) -> KeypointExtractor:
         """Choose keypoints and find them in ``observations``, the demonstrations' first images.
 
-        Raises `KeypointError` where the images have too little in common, or depth or foreground are missing.
+        With the demonstrations' ``trajectories`` the keypoints lie on what the hand approaches, grasps or moves
+        relative to, otherwise on all objects (and always with nearest neighbours). Raises `KeypointError` where the
+        images have too little in common, or depth or foreground are missing.
         """
         if not observations:
             raise KeypointError("no demonstrations were given; record at least one")
@@ -85,7 +100,7 @@ class KeypointExtractor:
         if self.correspondence == "nearest":
             return self._fit_nearest(observations, note)
         views = [make_view(observation, self.network_, self.workspace, self.seed) for observation in observations]
-        notes = [note, *dict.fromkeys(view.note for view in views if view.note)]
+        notes = [note, *dict.fromkeys(line for view in views for line in view.notes)]
         if len(views) == 1:
             notes.append(
                 "one demonstration only: nothing to compare it with, so the keypoints are its most salient points"
@@ -93,35 +108,40 @@ class KeypointExtractor:
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
         objects = find_objects(views, self.seed)
-        self.objects_ = [thing for thing in objects if thing.worst_fitness >= MIN_FITNESS]
+        self.objects_ = without(objects, [thing.worst_fitness < MIN_FITNESS for thing in objects])
         if not self.objects_:
             best = max((thing.worst_fitness for thing in objects), default=0.0)
             raise KeypointError(
                 f"the images have nothing in common: the best object of the first has a fitness of {best:.2f} in the "
                 f"worst other image (needed: {MIN_FITNESS:.2f}); do all demonstrations show the same object?"
             )
-        if len(self.objects_) > self.num_keypoints:
+        weights = _weights(self.objects_, views, trajectories)
+        counts = shares(weights, self.num_keypoints)
+        if (left := int(((weights > 0) & (np.array(counts) == 0)).sum())) > 0:
             notes.append(
-                f"{len(self.objects_)} objects were found for {self.num_keypoints} keypoints; the largest have one each"
+                f"{len(self.objects_)} objects were found for {self.num_keypoints} keypoints; {left} of them have none"
             )
-            self.objects_.sort(key=lambda thing: len(thing.templates[0].xyzrgb), reverse=True)
-            del self.objects_[self.num_keypoints :]
-        share, more = divmod(self.num_keypoints, len(self.objects_))
         self._places = []  # of each object's keypoints, in the first image
-        for number, thing in enumerate(self.objects_):
-            points, replaced = select_points(thing, views, share + (number < more), self.seed)
+        for thing, count in zip(self.objects_, counts, strict=True):
+            points, replaced = select_points(thing, views, count, self.seed) if count else (np.zeros((0, 3)), [])
             self._places.append(points)
             notes += replaced
         found = [self._locate(view, [t.registrations[i] for t in self.objects_]) for i, view in enumerate(views)]
         self.keypoints_ = np.stack([located.keypoints for located in found])
         self.pixels_ = np.stack([located.pixels for located in found])
+        self.object_of_ = np.repeat(np.arange(len(counts)), counts)
+        models = [thing.model for thing in self.objects_]
+        self.segmentations_ = tuple(
+            segmentation(models, [thing.registrations[i] for thing in self.objects_], view)
+            for i, view in enumerate(views)
+        )
         self.notes_ = tuple(notes)
         return self
 
     def _fit_nearest(self, observations: Sequence[Observation], note: str) -> KeypointExtractor:
         images = [Image.of(observation, self.network_) for observation in observations]
         self._shared, notes = share_descriptors(images, self.num_keypoints, self.seed)
-        self.objects_ = []
+        self.objects_, self.segmentations_, self.object_of_ = [], (), np.full(self.num_keypoints, -1)
         self.notes_ = (note, *notes)
         found = [
             (image.points(cells), image.pixels(cells)) for image, cells in zip(images, self._shared.cells, strict=True)
@@ -139,7 +159,7 @@ class KeypointExtractor:
             cells, similarity = self._shared.find(image)
             return Located(image.points(cells), image.pixels(cells), similarity)
         view = make_view(observation, self.network_, self.workspace, self.seed)
-        return self._locate(view, [register(thing.templates, view) for thing in self.objects_])
+        return self._locate(view, register_all([thing.model for thing in self.objects_], view))
 
     def _locate(self, view: View, registrations: Sequence[Registration]) -> Located:
         """The keypoints of objects with known ``registrations`` in ``view``."""
@@ -147,28 +167,53 @@ class KeypointExtractor:
         expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
         points, pixels, measured = lift_to_surface(view.observation, view.depth, expected)
         counts = [len(places) for places in self._places]
-        confidence = np.repeat([(found.fitness + found.similarity) / 2 for found in registrations], counts)
+        confidence = np.repeat([found.score for found in registrations], counts)
+        confidence *= np.concatenate(
+            [found.certainty(places) for found, places in zip(registrations, self._places, strict=True)]
+        )
         confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / RESIDUAL_M**2)
         confidence[~measured] /= 2
-        notes = [view.note] if view.note else []
+        notes = list(view.notes)
         for k in np.flatnonzero(~measured):
             notes.append(f"keypoint {k} has no depth at its pixel; it is where its object says")
         for number, found in enumerate(registrations):
-            if found.fitness < MIN_FITNESS:
+            if found.fitness < MIN_FITNESS and counts[number]:
                 notes.append(f"object {number} was hardly recognised (fit {found.fitness:.2f})")
-        return Located(points, pixels, np.clip(confidence, 0, 1), tuple(notes))
+        return Located(transform_points(view.to_world, points), pixels, np.clip(confidence, 0, 1), tuple(notes))
+
+
+def _weights(
+    things: Sequence[RigidObject], views: Sequence[View], trajectories: Sequence[Trajectory] | None
+) -> FloatArray:
+    """Of objects ``(O,)``, for their numbers of keypoints."""
+    places = [
+        [
+            transform_points(view.to_world @ found.motion, thing.points)
+            for view, found in zip(views, thing.registrations, strict=True)
+        ]
+        for thing in things
+    ]
+    if trajectories is not None:
+        relevant = relevances(places, trajectories)
+        relevant[relevant < MIN_RELEVANCE * relevant.max()] = 0
+        if relevant.any():
+            return relevant
+    sizes = np.array([len(points[0]) for points in places], dtype=np.float64)
+    weights = 1 + sizes / (1e3 * sizes.max())  # equal, but with too few keypoints the largest come first
+    scenery = np.array([still(points) for points in places])
+    return weights if scenery.all() else np.where(scenery, weights * SCENERY_WEIGHT, weights)
 
 
 def _expected_places(view: View, thing: RigidObject, places: FloatArray, found: Registration) -> FloatArray:
     """Where ``places (k, 3)`` of an object in the first image are in ``view``, metres, world."""
-    expected = transform_points(found.pose, places)
-    if found.fitness >= SAME_SHAPE_FITNESS:
+    expected = transform_points(found.motion, places)
+    if thing.model.varies or found.fitness >= SAME_SHAPE_FITNESS:
         return expected
     # An object of another size or articulation: register the neighbourhood of each keypoint.
-    template = thing.templates[0].xyzrgb
+    template = thing.model.templates[0].xyzrgb
     for k, place in enumerate(places):
         source = template[np.linalg.norm(template[:, :3] - place, axis=1) < NEIGHBOURHOOD_M]
         target = view.target[np.linalg.norm(view.target[:, :3] - expected[k], axis=1) < 2 * NEIGHBOURHOOD_M]
         if len(target):
-            expected[k] += register_translation(found.pose, source, target)
+            expected[k] += register_translation(found.motion, source, target)
     return expected

@@ -2,33 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
-from robust_instant_policy.perception.registration import refine, vote_for_motions
-from robust_instant_policy.perception.view import MIN_FOREGROUND_POINTS, View, subsample
+from robust_instant_policy.perception.parts import MIN_GAIN, candidate_parts, gain
+from robust_instant_policy.perception.registration import (
+    Candidates,
+    Similarity,
+    find_rivals,
+    fit_shape,
+    refine,
+    rotated,
+    settle_turn,
+    vote_for_motions,
+)
+from robust_instant_policy.perception.view import MIN_FOREGROUND_POINTS, UNRELATED, View, subsample
 
 MAX_TEMPLATE_POINTS = 250
 MAX_TEMPLATE_CELLS = 80
 SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of other points of the object
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
+CLAIM_M = 0.012  # from a registered object's points: image points that it explains
+RIVAL_SCALE = 0.01  # of the score by which a motion is worse, for a weight of 1/e
+SAME_PLACE_M = 0.02
+MIN_FITNESS = 0.15  # of an object's registration in every demonstration
+MIN_PART_FITNESS = 0.5  # median, of a part: things of one kind in other colours have 0.3, in the same 0.7
+MAX_OBJECTS = 30
+SHAPE_REACH_M = 0.03  # from an object: greatest distance of points of a larger one of its kind
+SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
+MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
+PART_TURNS = np.deg2rad(np.arange(-60.0, 90.0, 30.0))  # of a part against its object
+FAMILY_TURNS = np.zeros(1)  # of an object against itself with its parts
+MUCH_BETTER = 0.05  # of the score, by which an object's own registration overrules that with its parts
+MAX_PART_TRAVEL_M = 0.2
+TOUCH_M = 0.03
+MAX_SHARED_BY_PART = 0.6  # which touches its object
+MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """An object in an image: ``pose (4, 4)`` from the reference image's world to the image's; ``fitness`` of its
-    points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones.
+    """An object in an image: ``pose (4, 4)`` from the reference image's world to the image's, after the change of size
+    ``shape (4, 4)`` (`fit_shape`), together ``motion (4, 4)``; ``fitness`` of its
+    points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones;
+    ``rivals``: other motions that explain the image, the pose's own score first.
     """
 
     pose: FloatArray
     fitness: float
     similarity: float
     template: int
+    rivals: Candidates | None = None
+    shape: FloatArray = field(default_factory=lambda: np.eye(4))
+
+    @property
+    def motion(self) -> FloatArray:
+        return self.pose @ self.shape
+
+    @property
+    def score(self) -> float:
+        return (self.fitness + self.similarity) / 2
+
+    def certainty(self, points: FloatArray) -> FloatArray:
+        """Share ``(N,)``, in [0, 1], of the motions, weighted by how well they explain the image, that put ``points
+        (N, 3)`` of the reference image where this one does.
+        """
+        if self.rivals is None or not len(points):
+            return np.ones(len(points))
+        weights = np.exp(np.minimum(self.rivals.score - self.rivals.score[0], 0) / RIVAL_SCALE)
+        places = points @ np.swapaxes(self.rivals.motions[:, :3, :3], 1, 2) + self.rivals.motions[:, None, :3, 3]
+        same = np.linalg.norm(places - places[0], axis=2) < SAME_PLACE_M
+        return (weights[:, None] * same).sum(axis=0) / weights.sum()
 
 
 IN_REFERENCE = Registration(np.eye(4), 1.0, 1.0, 0)
@@ -47,13 +97,34 @@ class Template:
 
 
 @dataclass(frozen=True, eq=False)
-class RigidObject:
-    """An object of the reference image: a template of every image in which it was seen, the reference's first, and
-    its ``registrations`` in all images.
+class Model:
+    """What an object looks like: its ``templates``, the reference image's first; ``parent``: for a part that moves
+    against the rest of an object, the number of that, otherwise -1; ``family``: templates of an object with all its
+    parts, which tell its turn where it alone is symmetric; whether it ``varies`` in size between images.
     """
 
     templates: tuple[Template, ...]
+    parent: int = -1
+    family: tuple[Template, ...] = ()
+    varies: bool = False
+
+    @property
+    def points(self) -> FloatArray:
+        """``(N, 3)`` in the reference image, metres."""
+        return self.templates[0].xyzrgb[:, :3].astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class RigidObject:
+    """An object of the reference image: its ``model``, and its ``registrations`` in all images."""
+
+    model: Model
     registrations: tuple[Registration, ...]
+
+    @property
+    def points(self) -> FloatArray:
+        """``(N, 3)`` in the reference image, metres."""
+        return self.model.points
 
     @property
     def worst_fitness(self) -> float:
@@ -61,29 +132,249 @@ class RigidObject:
 
 
 def find_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
-    """The segments of the first view, registered in all ``views``."""
-    first = views[0]
+    """The rigid objects of the first view, registered in all ``views``.
+
+    A piece of the first view is one object, or several if parts of it move differently in the other views.
+    """
+    home = views[0]
+    pieces = [piece for piece in home.pieces if len(piece) >= MIN_FOREGROUND_POINTS]
+    models = [Model((_template_of(home, piece, seed),)) for piece in pieces]
+    found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
+    number = 0
+    while number < len(models) and len(views) > 1:
+        if models[number].parent >= 0:  # parts have no parts
+            number += 1
+            continue
+        split = _split(home, pieces[number], views[1:], [row[number] for row in found[1:]], seed)
+        if split is None or len(models) >= MAX_OBJECTS:
+            number += 1
+            continue
+        rest, part, pairs = split
+        models[number] = replace(models[number], templates=(_template_of(home, rest, seed),))
+        models.append(Model((_template_of(home, part, seed),), number))
+        pieces[number] = rest
+        pieces.append(part)
+        found[0].append(IN_REFERENCE)
+        for row, (of_rest, of_part) in zip(found[1:], pairs, strict=True):
+            row[number] = of_rest
+            row.append(of_part)
+    models = _attached(models, [len(piece) for piece in pieces], found)
+    for number in {model.parent for model in models} - {-1}:
+        members = [i for i, model in enumerate(models) if i == number or model.parent == number]
+        family = (_template_of(home, np.concatenate([pieces[i] for i in members]), seed),)
+        models[number] = replace(models[number], family=family)
+    things = [_complete(models, found, number, views, seed) for number in range(len(models))]
+    shapes = [
+        _shapes([thing.model for thing in things], [thing.registrations[i] for thing in things], view)
+        for i, view in enumerate(views)
+    ]
     return [
-        _model(views, first.xyzrgb[subsample(segment, MAX_TEMPLATE_POINTS, seed)], seed)
-        for segment in first.segments
-        if len(segment) >= MIN_FOREGROUND_POINTS
+        thing if not varies else _with_shapes(thing, [row[number] for row in shapes])
+        for number, (thing, varies) in enumerate(zip(things, _vary(np.array(shapes)), strict=True))
     ]
 
 
-def _model(views: Sequence[View], xyzrgb: Float32Array, seed: int) -> RigidObject:
-    """The object of ``xyzrgb (N, 6)`` in the first of ``views``. Each other view adds a template, the best first."""
-    templates = [_template(views[0], np.eye(4), xyzrgb, xyzrgb, seed)]
-    registrations = [IN_REFERENCE, *(register(templates, view) for view in views[1:])]
-    for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].fitness - registrations[i].similarity):
-        registrations[i] = register(templates, views[i])
-        known = templates[registrations[i].template].xyzrgb
-        to_reference = invert_pose(registrations[i].pose)
-        points = transform_points(to_reference, views[i].target[:, :3])
-        same = cKDTree(known[:, :3]).query(points)[0] < SAME_OBJECT_M
-        if same.any():
-            seen = np.concatenate([points, views[i].target[:, 3:]], axis=1)[same].astype(np.float32)
-            templates.append(_template(views[i], to_reference, seen, known, seed))
-    return RigidObject(tuple(templates), tuple(registrations))
+def _attached(models: Sequence[Model], sizes: Sequence[int], found: Sequence[Sequence[Registration]]) -> list[Model]:
+    """``models``, where what touches a larger object and stays near it in most images is a part of that."""
+    attached = list(models)
+    if len(found) < MIN_IMAGES_OF_KIND:
+        return attached
+    for i, model in enumerate(models):
+        centre = model.points.mean(axis=0)
+        for k, other in enumerate(attached):
+            if attached[i].parent >= 0 or other.parent >= 0 or sizes[k] <= sizes[i] or k == i:
+                continue
+            if any(one.parent == i for one in attached) or cKDTree(other.points).query(model.points)[0].min() > TOUCH_M:
+                continue
+            moved = [transform_points(invert_pose(row[k].pose) @ row[i].pose, centre) - centre for row in found[1:]]
+            if np.median(np.linalg.norm(moved, axis=1)) < MAX_PART_TRAVEL_M / 2:
+                attached[i] = replace(model, parent=k)
+    return attached
+
+
+def _vary(shapes: FloatArray) -> NDArray[np.bool_]:
+    """Which objects ``(O,)`` differ in size between images, from their ``shapes (I, O, 4, 4)``."""
+    if len(shapes) < MIN_IMAGES_OF_KIND:
+        return np.zeros(shapes.shape[1], dtype=bool)
+    stretch = np.abs(np.log(np.linalg.eigvalsh(shapes[1:, :, :3, :3]))).max(axis=2)
+    return np.median(stretch, axis=0) > SAME_SIZE
+
+
+def _with_shapes(thing: RigidObject, shapes: Sequence[FloatArray]) -> RigidObject:
+    """``thing``, which differs in size, with its ``shapes`` in all images."""
+    pairs = zip(thing.registrations, shapes, strict=True)
+    return replace(
+        thing, model=replace(thing.model, varies=True), registrations=tuple(replace(r, shape=s) for r, s in pairs)
+    )
+
+
+def _shapes(models: Sequence[Model], found: Sequence[Registration], view: View) -> list[FloatArray]:
+    """The change of size ``(4, 4)`` of each object: image points belong to the nearest."""
+    if not models:
+        return []
+    points = view.target[:, :3].astype(np.float64)
+    owner = _owners(models, [one.pose for one in found], points)
+    return [
+        fit_shape(one.pose, model.points, points[owner == i])
+        for i, (model, one) in enumerate(zip(models, found, strict=True))
+    ]
+
+
+def _owners(models: Sequence[Model], motions: Sequence[FloatArray], points: FloatArray) -> IntArray:
+    """Number ``(N,)`` of the nearest object, at its motion, to each of ``points (N, 3)``; -1 where none is near."""
+    moved = [transform_points(motion, model.points) for model, motion in zip(models, motions, strict=True)]
+    distances = np.array([cKDTree(one).query(points)[0] for one in moved])
+    return np.where(distances.min(axis=0) < SHAPE_REACH_M, distances.argmin(axis=0), -1)
+
+
+def segmentation(models: Sequence[Model], found: Sequence[Registration], view: View) -> NDArray[np.int16]:
+    """``(H, W)``: the number of the object at each pixel of ``view``, or the key in `REASONS` of why there is none."""
+    labels = view.labels.copy()
+    owner = _owners(models, [one.motion for one in found], view.points)
+    labels[labels >= 0] = np.where(owner >= 0, owner, UNRELATED)
+    height, width = view.depth.shape
+    return labels.repeat(view.stride, axis=0).repeat(view.stride, axis=1)[:height, :width]
+
+
+def without(things: Sequence[RigidObject], dropped: Sequence[bool]) -> list[RigidObject]:
+    """``things`` without those ``dropped``; their parts stand alone."""
+    new_number = np.where(dropped, -1, np.cumsum(~np.array(dropped)) - 1)
+    return [
+        replace(
+            thing,
+            model=replace(thing.model, parent=int(new_number[thing.model.parent]) if thing.model.parent >= 0 else -1),
+        )
+        for thing, drop in zip(things, dropped, strict=True)
+        if not drop
+    ]
+
+
+Pair = tuple[Registration, Registration]
+
+
+def _split(
+    home: View, piece: IntArray, views: Sequence[View], found: Sequence[Registration], seed: int
+) -> tuple[IntArray, IntArray, list[Pair]] | None:
+    """The rest of a ``piece`` of the first view and a part of it that moves differently, with the registrations of both
+    in ``views``; None if it is rigid. ``found``: the registrations of the whole.
+    """
+    motions = [one.pose for one in found]
+    best, split = MIN_GAIN, None
+    for part in candidate_parts(home, piece, views, motions):
+        rest_model, part_model = (Model((_template_of(home, piece[which], seed),)) for which in (~part, part))
+        pairs = []
+        for view, whole in zip(views, found, strict=True):
+            rest = register(rest_model.templates, view, near=whole.pose)
+            taken = _explained([rest_model], [rest], [0])
+            pairs.append((rest, register(part_model.templates, view, taken, rest.pose, PART_TURNS)))
+        fitness = [own.fitness for _, own in pairs]
+        if min(fitness) < MIN_FITNESS or np.median(fitness) < MIN_PART_FITNESS:
+            continue
+        gained = gain(home.points[piece[part]], views, motions, [own.pose for _, own in pairs])
+        if gained > best:
+            best, split = gained, (piece[~part], piece[part], pairs)
+    return split
+
+
+def _complete(
+    models: Sequence[Model], found: Sequence[Sequence[Registration]], number: int, views: Sequence[View], seed: int
+) -> RigidObject:
+    """Object ``number`` with templates from all views, and registered with them; the best views come first."""
+    model, registrations = models[number], [row[number] for row in found]
+    templates = list(model.templates)
+    for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
+        better = [k for k in range(len(models)) if found[i][k].score > found[i][number].score]
+        taken = _explained(models, found[i], better)
+        grown = replace(model, templates=tuple(templates))
+        registrations[i] = _register_model(grown, views[i], found[i], taken, registrations[i].pose)
+        templates += _another_template(views[i], registrations[i], templates, seed)
+    return RigidObject(replace(model, templates=tuple(templates)), tuple(registrations))
+
+
+def _register_model(
+    model: Model,
+    view: View,
+    found: Sequence[Registration] | Mapping[int, Registration],
+    taken: FloatArray | None = None,
+    near: FloatArray | None = None,
+) -> Registration:
+    """One object: a part near its parent, which was ``found``, and an object with parts where they fit, too."""
+    if model.parent >= 0:
+        return register(model.templates, view, taken, found[model.parent].pose, PART_TURNS)
+    if model.family:
+        family = register(model.family, view, taken)
+        found_in_family = register(model.templates, view, taken, family.pose, FAMILY_TURNS, alone=False)
+        found_alone = register(model.templates, view, taken, near)
+        return found_alone if found_alone.score > found_in_family.score + MUCH_BETTER else found_in_family
+    return register(model.templates, view, taken, near)
+
+
+def register_all(models: Sequence[Model], view: View) -> list[Registration]:
+    """Find all objects in ``view``, so that no two explain the same points of it.
+
+    Each is registered on its own, a part near its object. From the best one on, an object that explains points of
+    better ones is registered again without those.
+    """
+    found: dict[int, Registration] = {}
+    for i in sorted(range(len(models)), key=lambda i: models[i].parent >= 0):  # parts come after their objects
+        found[i] = _register_model(models[i], view, found)
+    tree = cKDTree(view.target[:, :3])
+    taken = np.zeros(len(view.target), dtype=bool)
+    settled: list[int] = []
+    for i in sorted(range(len(models)), key=lambda i: -found[i].score):
+        if _shared(tree, taken, models[i], found[i]) > (MAX_SHARED if models[i].parent < 0 else MAX_SHARED_BY_PART):
+            again = _register_model(models[i], view, found, _explained(models, found, settled))
+            options = [
+                replace(one, fitness=one.fitness * (1 - _shared(tree, taken, models[i], one)))
+                for one in (found[i], again)
+            ]
+            found[i] = max(options, key=lambda one: one.score)
+        settled.append(i)
+        taken[_claim(tree, models[i], found[i])] = True
+    result = [found[i] for i in range(len(models))]
+    if not any(model.varies for model in models):
+        return result
+    pairs = zip(models, result, _shapes(models, result, view), strict=True)
+    return [replace(one, shape=shape) if model.varies else one for model, one, shape in pairs]
+
+
+def _explained(
+    models: Sequence[Model], found: Sequence[Registration] | Mapping[int, Registration], which: Sequence[int]
+) -> FloatArray:
+    """Points ``(N, 3)`` of the objects ``which``, where they were found."""
+    moved = [transform_points(found[i].motion, models[i].templates[found[i].template].xyzrgb[:, :3]) for i in which]
+    return np.concatenate([np.zeros((0, 3)), *moved])
+
+
+def _claim(tree: cKDTree, model: Model, found: Registration) -> IntArray:
+    """Numbers of the points in ``tree`` that an object explains."""
+    moved = transform_points(found.motion, model.templates[found.template].xyzrgb[:, :3])
+    near = tree.query_ball_point(moved, CLAIM_M)
+    return np.unique(np.concatenate([np.asarray(one, dtype=np.intp) for one in near]))
+
+
+def _shared(tree: cKDTree, taken: NDArray[np.bool_], model: Model, found: Registration) -> float:
+    """Share of the points that an object explains that are ``taken (M,)``."""
+    claimed = _claim(tree, model, found)
+    return float(taken[claimed].mean()) if len(claimed) else 0.0
+
+
+def _another_template(view: View, found: Registration, templates: Sequence[Template], seed: int) -> list[Template]:
+    """The object as ``view`` shows it, or nothing where it does not."""
+    to_reference = np.asarray(np.linalg.inv(found.motion), dtype=np.float64)
+    known = templates[found.template].xyzrgb
+    points = transform_points(to_reference, view.target[:, :3])
+    same = cKDTree(known[:, :3]).query(points)[0] < SAME_OBJECT_M
+    if not same.any():
+        return []
+    seen = np.concatenate([points, view.target[:, 3:]], axis=1)[same].astype(np.float32)
+    return [_template(view, to_reference, seen, known, seed)]
+
+
+def _template_of(home: View, piece: IntArray, seed: int) -> Template:
+    """Of the points ``piece`` of the reference image."""
+    points = home.xyzrgb[subsample(piece, MAX_TEMPLATE_POINTS, seed)]
+    return _template(home, np.eye(4), points, points, seed)
 
 
 def _template(view: View, to_reference: FloatArray, xyzrgb: Float32Array, known: Float32Array, seed: int) -> Template:
@@ -94,14 +385,52 @@ def _template(view: View, to_reference: FloatArray, xyzrgb: Float32Array, known:
     return Template(view, xyzrgb[kept], view.cells[near], points[near])
 
 
-def register(templates: Sequence[Template], view: View) -> Registration:
-    """Find the object of ``templates`` in ``view``."""
-    similar = [t.view.descriptors.similarities(t.cells, view.descriptors, view.cells) for t in templates]
-    with_foreground = [table[:, : len(view.cell_points)] for table in similar]
-    points = np.concatenate([template.points for template in templates])
-    motions = vote_for_motions(points, view.cell_points, np.concatenate(with_foreground))
-    index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
+def register(
+    templates: Sequence[Template],
+    view: View,
+    taken: FloatArray | None = None,
+    near: FloatArray | None = None,
+    turns: FloatArray | None = None,
+    alone: bool = True,
+) -> Registration:
+    """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world.
 
+    ``near (4, 4)``: another motion to start from. With ``turns (A,)`` it is turned by these, and those from elsewhere
+    are left out; unless ``alone``, all others are.
+    """
+    target, free = view.target, np.arange(len(view.cell_points))
+    if taken is not None and len(taken):
+        others = cKDTree(taken)
+        target = target[others.query(target[:, :3], distance_upper_bound=CLAIM_M)[0] > CLAIM_M]
+        free = np.flatnonzero(others.query(view.cell_points, distance_upper_bound=CLAIM_M)[0] > CLAIM_M)
+        if len(target) < MIN_FOREGROUND_POINTS or not len(free):
+            return Registration(np.eye(4), 0.0, 0.0, 0)
+    similar = [t.view.descriptors.similarities(t.cells, view.descriptors, view.cells) for t in templates]
+    with_foreground = [table[:, free] for table in similar]
+    points = np.concatenate([template.points for template in templates])
+    motions = np.zeros((0, 4, 4))
+    if alone:
+        motions = vote_for_motions(points, view.cell_points[free], np.concatenate(with_foreground))
+    if near is not None:
+        centre = points.mean(axis=0)
+        motions = np.concatenate([rotated(near, centre, np.zeros(1) if turns is None else turns), motions])
+        if turns is not None:
+            travel = motions[:, :3, :3] @ centre + motions[:, :3, 3] - transform_points(near, centre)
+            motions = motions[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
+    index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
+    source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
+    candidates = refine(motions, source, target, similarity)
+    pose = settle_turn(candidates.motions[0], source, target, similarity)
+    rivals = find_rivals(pose, source, target, similarity)
+    return Registration(pose, float(candidates.fitness[0]), float(candidates.similarity[0]), index, rivals)
+
+
+def _similarity(templates: Sequence[Template], view: View, similar: Sequence[Float32Array]) -> Similarity:
+    """A function of motions ``(C, 4, 4)``: the mean descriptor similarity ``(C,)`` at their places.
+
+    ``similar``: for each template the similarities of its cells and the view's.
+    """
+    points = np.concatenate([template.points for template in templates])
     # Column of each cell of the map; those far from all foreground share a last one of zeros.
     column = np.full(view.descriptors.features.shape[0] * view.descriptors.features.shape[1], len(view.cells))
     column[view.cells] = np.arange(len(view.cells))
@@ -110,7 +439,6 @@ def register(templates: Sequence[Template], view: View) -> Registration:
     starts = np.cumsum(sizes) - sizes
 
     def similarity(motions: FloatArray) -> FloatArray:
-        """Mean descriptor similarity ``(C,)`` at the places of ``motions (C, 4, 4)``, of the best templates."""
         moved = points @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
         pixels = project(moved.reshape(-1, 3), view.observation.intrinsics, view.observation.camera_pose)
         cells, shares = view.descriptors.around(pixels)
@@ -119,4 +447,4 @@ def register(templates: Sequence[Template], view: View) -> Registration:
         means = np.add.reduceat(values, starts, axis=1) / sizes
         return np.sort(means, axis=1)[:, -BEST_TEMPLATES:].mean(axis=1)
 
-    return Registration(*refine(motions, templates[index].xyzrgb, view.target, similarity), index)
+    return similarity

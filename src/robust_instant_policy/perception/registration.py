@@ -1,19 +1,30 @@
-"""Registration of XYZRGB points by a rotation about the vertical and a translation.
+"""Registration of XYZRGB points by a rotation about the vertical and a translation, in three steps.
 
-Descriptor matches vote for motions (Hough 1962); ICP in space and colour (Besl and McKay 1992) refines the best.
+1. `vote_for_motions`: matches of descriptors vote for motions (Hough 1962), and those with the most votes go on.
+2. `refine`: ICP in space and colour (Besl and McKay 1992) refines each, coarsely, then the best ones with all points.
+3. `rivals`: which other motions explain the image nearly as well.
+
 Objects stand on a table, so rotations are about the world's z axis only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robust_instant_policy.geometry import FloatArray, fit_upright, rotations_about_vertical, transform_points
+from robust_instant_policy.geometry import (
+    FloatArray,
+    fit_upright,
+    invert_pose,
+    rotations_about_vertical,
+    transform_points,
+)
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 
+# Votes.
 ANGLE_BINS = 24
 SHIFT_BIN_M = 0.015
 MAX_PEAKS = 4
@@ -21,19 +32,34 @@ SUPPRESSED_BINS = 3  # around a peak, on each side
 MATCHES_PER_POINT = 3
 MAX_MATCHES = 400  # the most similar; more do not change the peaks
 VOTE_EXPONENT = 4  # of the similarity, for a match's vote
+# ICP.
 COLOUR_CAP_M = 0.010  # greatest colour distance: objects of one kind have many colours
 RESIDUAL_M = 0.010  # at which a point counts 1/e in the fitness
 OWN_REACH_M = 0.04  # image points further from the object belong to others
 RESTART_ANGLES = np.deg2rad([0.0, -25.0, 25.0])
-SYMMETRY_ANGLES = np.deg2rad(np.arange(-20.0, 25.0, 5.0))  # the middle one is none
-MAX_SYMMETRY_LOSS = 0.04  # of the fitness, by these rotations, for a rotationally symmetric object
-SIMILARITY_SCALE = 0.01  # of the softmax over these rotations
 COARSE_POINTS = 60
 FINALISTS = 3
-COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)  # kernel width in each ICP iteration
+COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)  # kernel width in each iteration
 FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
 LOCAL_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
 MIN_WEIGHT = np.float32(1e-9)  # keeps the weights' sum above zero
+# Symmetry and rivals.
+SMALL_TURNS = np.deg2rad(np.arange(-20.0, 25.0, 5.0))  # the middle one is none
+MAX_SYMMETRY_LOSS = 0.04  # of the fitness, by small turns, for a rotationally symmetric object
+SIMILARITY_SCALE = 0.01  # of the softmax over small turns
+LARGE_TURNS = np.deg2rad(np.arange(30.0, 360.0, 30.0))
+SLIDES_M = 0.025 * np.array(
+    [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]
+)
+RIVAL_REACH_M = (0.02, 0.015)
+
+# Shape.
+MIN_SHAPE_POINTS = 25
+EXTENT_PERCENTILES = (2.0, 98.0)
+MIN_EXTENT_M = 0.01  # flatter things are not stretched
+MAX_STRETCH = 1.4
+
+Similarity = Callable[[FloatArray], FloatArray]
 
 
 def vote_for_motions(source: FloatArray, target: FloatArray, similarities: Float32Array) -> FloatArray:
@@ -69,31 +95,104 @@ def vote_for_motions(source: FloatArray, target: FloatArray, similarities: Float
     return np.array(motions)
 
 
-def refine(
-    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Callable[[FloatArray], FloatArray]
-) -> tuple[FloatArray, float, float]:
-    """The best motion ``(4, 4)`` after ICP from ``motions (P, 4, 4)``; its fitness and similarity, both in [0, 1].
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """``motions (C, 4, 4)``, the best first, with the ``fitness (C,)`` of their points and the ``similarity (C,)`` of
+    their descriptors, both in [0, 1].
+    """
+
+    motions: FloatArray
+    fitness: FloatArray
+    similarity: FloatArray
+
+    @property
+    def score(self) -> FloatArray:
+        """``(C,)`` in [0, 1]."""
+        return (self.fitness + self.similarity) / 2
+
+
+def refine(motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> Candidates:
+    """The best candidates after ICP from ``motions (P, 4, 4)``.
 
     ``source (N, 6)`` and ``target (M, 6)`` are XYZRGB points; ``similarity`` is that of the descriptors under each of
-    several motions. A subset of the points selects `FINALISTS`, all points the best.
+    several motions. A subset of the points selects `FINALISTS`, all points order them.
     """
     centre = source[:, :3].mean(axis=0)
     starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
-    coarse = source[:: max(1, len(source) // COARSE_POINTS)], target[:: max(1, len(target) // (3 * COARSE_POINTS))]
-    starts, fitness = icp(starts, *coarse, COARSE_REACH_M)
+    starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M)
     leading = np.argsort(-fitness - similarity(starts))[:FINALISTS]
-    finalists, fitness = icp(starts[leading], source, target, FINE_REACH_M)
+    finalists, fitness = icp(starts[leading], source, _around(starts[leading], source, target), FINE_REACH_M)
     similarities = similarity(finalists)
-    best = int((fitness + similarities).argmax())
-    motion = finalists[best]
-    alternatives = rotated(motion, centre, SYMMETRY_ANGLES)
-    rotated_fitness = icp(alternatives, *coarse, ())[1]
-    if rotated_fitness.min() > rotated_fitness[len(alternatives) // 2] - MAX_SYMMETRY_LOSS:
-        # Points do not determine the rotation of a disc: take the descriptors' mean rotation.
-        likelihood = similarity(alternatives)
-        share = np.exp((likelihood - likelihood.max()) / SIMILARITY_SCALE)
-        motion = rotated(motion, centre, np.atleast_1d(share @ SYMMETRY_ANGLES / share.sum()))[0]
-    return motion, float(fitness[best]), float(similarities[best])
+    order = np.argsort(-fitness - similarities, kind="stable")
+    return Candidates(finalists[order], fitness[order], similarities[order])
+
+
+def settle_turn(motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> FloatArray:
+    """``motion (4, 4)``, turned to the descriptors' mean rotation if points do not determine it, as for a disc."""
+    centre = source[:, :3].mean(axis=0)
+    alternatives = rotated(motion, centre, SMALL_TURNS)
+    target = _around(motion[None], source, target)
+    fitness = icp(alternatives, *_coarse(source, target), ())[1]
+    if fitness.min() <= fitness[len(alternatives) // 2] - MAX_SYMMETRY_LOSS:
+        return motion
+    likelihood = similarity(alternatives)
+    share = np.exp((likelihood - likelihood.max()) / SIMILARITY_SCALE)
+    return rotated(motion, centre, np.atleast_1d(share @ SMALL_TURNS / share.sum()))[0]
+
+
+def find_rivals(motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> Candidates:
+    """``motion (4, 4)`` itself, and that turned by `LARGE_TURNS` or slid by `SLIDES_M`, measured with a subset."""
+    centre = source[:, :3].mean(axis=0)
+    turned = rotated(motion, centre, LARGE_TURNS)
+    slid = np.repeat(motion[None], len(SLIDES_M), axis=0)
+    slid[:, :3, 3] += SLIDES_M
+    coarse = _coarse(source, _around(motion[None], source, target))
+    turned = icp(turned, *coarse, RIVAL_REACH_M)[0]
+    motions = np.concatenate([motion[None], turned, slid])
+    return Candidates(motions, icp(motions, *coarse, ())[1], similarity(motions))
+
+
+def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
+    """How an object of the same kind differs in size: an affine map ``(4, 4)`` of its own frame, before ``motion``.
+
+    It stretches ``source (N, 3)`` along its horizontal axes, and lifts it, to the extent of the image's points of it,
+    ``goals (M, 3)``.
+    """
+    goals = transform_points(invert_pose(motion), goals)
+    shape = np.eye(4)
+    if len(goals) < MIN_SHAPE_POINTS:
+        return shape
+    axes = horizontal_axes(source)
+    lower, upper = np.percentile(source @ axes.T, EXTENT_PERCENTILES, axis=0)
+    new_lower, new_upper = np.percentile(goals @ axes.T, EXTENT_PERCENTILES, axis=0)
+    scale = (new_upper - new_lower) / np.maximum(upper - lower, MIN_EXTENT_M)
+    scale = np.where(upper - lower < MIN_EXTENT_M, 1, scale.clip(1 / MAX_STRETCH, MAX_STRETCH))
+    # How far down its sides are seen depends on the view: upward, only the top moves.
+    scale[2], lower[2], new_lower[2] = 1, upper[2], new_upper[2]
+    shape[:3, :3] = axes.T @ np.diag(scale) @ axes
+    shape[:3, 3] = axes.T @ ((new_lower + new_upper) / 2 - scale * (lower + upper) / 2)
+    return shape
+
+
+def horizontal_axes(points: FloatArray) -> FloatArray:
+    """Rows ``(3, 3)``: the sides of the smallest upright box around ``points (N, 3)``."""
+    turns = rotations_about_vertical(np.deg2rad(np.arange(0.0, 90.0, 3.0)))
+    extent = np.diff(np.percentile(points @ np.swapaxes(turns, 1, 2), EXTENT_PERCENTILES, axis=1), axis=0)[0]
+    return turns[(extent[:, 0] * extent[:, 1]).argmin()]
+
+
+def _around(motions: FloatArray, source: Float32Array, target: Float32Array) -> Float32Array:
+    """Those of ``target (M, 6)`` that ``source (N, 6)`` may reach from ``motions (C, 4, 4)``; at least one."""
+    centre = source[:, :3].mean(axis=0)
+    reach = np.linalg.norm(source[:, :3] - centre, axis=1).max() + max(COARSE_REACH_M)
+    places = motions[:, :3, :3] @ centre + motions[:, :3, 3]
+    near = (np.linalg.norm(target[:, None, :3] - places, axis=2) < reach).any(axis=1)
+    return target[near] if near.any() else target[:1]
+
+
+def _coarse(source: Float32Array, target: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """A subset of both."""
+    return source[:: max(1, len(source) // COARSE_POINTS)], target[:: max(1, len(target) // (3 * COARSE_POINTS))]
 
 
 def rotated(motion: FloatArray, centre: FloatArray, angles: FloatArray) -> FloatArray:

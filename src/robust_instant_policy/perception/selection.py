@@ -26,13 +26,13 @@ def select_points(thing: RigidObject, views: Sequence[View], count: int, seed: i
     it is seen, images in which it is a mutual nearest neighbour, saliency), less its distance from the centre. A
     point without depth in some image is replaced by the next best.
     """
-    points = thing.templates[0].xyzrgb[:, :3].astype(np.float64)
+    points = thing.points
     home = views[0]
     pixels = project(points, home.observation.intrinsics, home.observation.camera_pose)
     seen = np.zeros(len(points))
     has_depth = np.ones(len(points), dtype=bool)
     for view, registration in zip(views, thing.registrations, strict=True):
-        expected = transform_points(registration.pose, points)
+        expected = transform_points(registration.motion, points)
         seen += cKDTree(view.points).query(expected)[0] < SEEN_M
         has_depth &= lift_to_surface(view.observation, view.depth, expected)[2]
     score = seen / len(views) + _mutual_matches(thing, views, points)
@@ -76,6 +76,6 @@ def _mutual_matches(thing: RigidObject, views: Sequence[View], points: FloatArra
         match = similar.argmax(axis=1)
         back = similar.argmax(axis=0)[match]
         mutual = np.linalg.norm(home.cell_points[back] - home.cell_points, axis=1) < reach
-        expected = transform_points(registration.pose, home.cell_points)
+        expected = transform_points(registration.motion, home.cell_points)
         votes += mutual & (np.linalg.norm(view.cell_points[match] - expected, axis=1) < reach)
     return votes[cKDTree(home.cell_points).query(points)[1]] / (len(views) - 1)

@@ -1,16 +1,19 @@
-"""One image, prepared for registration: its descriptors, and the XYZRGB points that do not belong to the table."""
+"""One image, prepared for registration: its descriptors, and the XYZRGB points that stand on the table."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, maximum_filter, uniform_filter
+from scipy.ndimage import uniform_filter
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError
-from robust_instant_policy.geometry import FloatArray, lift
+from robust_instant_policy.geometry import FloatArray, invert_pose, lift
 from robust_instant_policy.perception.descriptors import (
     NEIGHBOURS,
     DescriptorMap,
@@ -18,16 +21,14 @@ from robust_instant_policy.perception.descriptors import (
     Float32Array,
     IntArray,
 )
-from robust_instant_policy.pointcloud import in_metres, steady, table_plane
+from robust_instant_policy.perception.table import Table, levelling
+from robust_instant_policy.pointcloud import in_metres, steady
 
 MAX_CENTRE_OFFSET = 0.4  # of the principal point from the image centre, of half the image
-MAX_EDGE_PX = 256  # larger images are subsampled: enough for millimetres, and fast
+MIN_EDGE_PX = 320  # of the longer edge after subsampling: enough for millimetres, and fast
 UNBOUNDED = np.array([[-np.inf] * 3, [np.inf] * 3])  # metres
 MIN_STEADY_PIXELS = 100
 MIN_FOREGROUND_POINTS = 25
-MIN_HEIGHT_M = 0.010  # above the table, for points of objects,
-MIN_HEIGHT_DEVIATIONS = 4.0  # or this many standard deviations of the depth noise, if that is more
-MAD_TO_DEVIATION = 1.4826  # standard deviation of a Gaussian with median absolute deviation 1
 MIN_DISTANCE_SMOOTHED = 4.0  # Mahalanobis distance of a flat point's smoothed colour from the table's,
 MIN_DISTANCE_POINT = 2.5  # and of its own colour, so that smoothing adds no border to objects
 SMOOTHING_PX = 5  # evens out the grain of the table
@@ -35,33 +36,58 @@ COLOUR_SAMPLES = 1000
 TRIM_ROUNDS = 4
 TRIM_DEVIATIONS = 3.0
 COLOUR_NOISE = 0.02  # standard deviation of the camera's noise in a colour channel, of a range of 1
-SEGMENT_GAP_M = 0.02  # foreground points further apart in the image belong to different segments
-MIN_SEGMENT_POINTS = 15
-MAX_SEGMENT_POINTS = 500  # of a segment, in `View.target`
+GAP_M = 0.015  # foreground points further apart in space belong to different pieces,
+GAP_PX = 3  # but those of pixels this near do not,
+HIDDEN_GAP_M = 0.020  # nor those of such pixels this near in a horizontal direction: sides may be hidden from above
+MIN_PIECE_POINTS = 15
+MIN_TOLD_POINTS = 8  # smaller pieces are noise
+MAX_TOLD = 3
+TARGET_M = 0.005  # edge of the cubes with one point each in `View.target`
 COLOUR_SCALE_M = 0.06  # metres in an XYZRGB point for the difference between black and white in one channel
+MIN_TILT_RAD = np.deg2rad(1.0)  # of the table in the world; less is the noise of its plane
+BORDER_SHARE = 0.01  # of the image's width and height, at its border
+HOVERING_M = 0.06  # above the table where it crosses the image's border: an arm or a person
+TALLEST_M = 0.8  # of what stands on a table
+
+TABLE, BELOW, BESIDE, HIGH, BORDER, SMALL, OUTSIDE, UNKNOWN, UNRELATED = -1, -2, -3, -4, -5, -6, -7, -8, -9
+REASONS = {
+    TABLE: "table",
+    BELOW: "below the table",
+    BESIDE: "beside the table",
+    HIGH: "too high for a thing on the table",
+    BORDER: "reaches in over the image's border, as an arm does",
+    SMALL: "too small",
+    OUTSIDE: "outside the workspace",
+    UNKNOWN: "no steady depth",
+    UNRELATED: "no object that all demonstrations show",
+}
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """An ``observation``, its ``descriptors``, its ``depth (H, W)`` in metres, and its foreground.
 
-    Foreground: ``points (N, 3)`` in metres, world; the same as ``xyzrgb (N, 6)`` in metres, colours in units of
-    `COLOUR_SCALE_M`; ``segments``, the points' numbers by connected component; ``target (M, 6)``, a sample of
+    The world of a view is level: ``to_world (4, 4)`` maps it to the world of the given camera pose, from which it
+    differs where that is tilted. Foreground: ``points (N, 3)`` in metres; the same as ``xyzrgb (N, 6)``, colours in
+    units of `COLOUR_SCALE_M`; ``pieces``, the points' numbers by connected piece; ``target (M, 6)``, a sample of
     ``xyzrgb`` to which objects are registered; ``cells (C,)`` of the descriptor map: first those with foreground,
-    whose mean points are ``cell_points (F, 3)``, then their neighbours. ``note`` tells if the depth was in another
-    unit, or is empty.
+    whose mean points are ``cell_points (F, 3)``, then their neighbours. ``labels (h, w)``, subsampled by ``stride``: a
+    pixel's piece, or the key in `REASONS` of what it is instead. ``notes`` tell what was unusual.
     """
 
     observation: Observation
     descriptors: DescriptorMap
     depth: Float32Array
+    to_world: FloatArray
     points: FloatArray
     xyzrgb: Float32Array
-    segments: tuple[IntArray, ...]
+    pieces: tuple[IntArray, ...]
     target: Float32Array
     cells: IntArray
     cell_points: FloatArray
-    note: str
+    labels: NDArray[np.int16]
+    stride: int
+    notes: tuple[str, ...]
 
 
 def make_view(
@@ -70,21 +96,15 @@ def make_view(
     """Describe and segment an image.
 
     A point is foreground by its height above the table, or, when flat, by the network's saliency and a colour that
-    differs from the table's. Points outside ``workspace (2, 3)``, metres, world, are not foreground; its lower z is
-    ignored. Raises `KeypointError` for intrinsics of another resolution, and for too few depth readings or foreground
-    points.
+    differs from the table's. What is below or beside the table, outside ``workspace (2, 3)`` (metres, world; its lower
+    z is ignored), or reaches in over the border is not. Raises `KeypointError` for intrinsics of another resolution,
+    and for too few depth readings or foreground points.
     """
-    height, width = observation.depth.shape
-    cx, cy = observation.intrinsics[:2, 2]
-    if not (abs(cx / (width / 2) - 1) < MAX_CENTRE_OFFSET and abs(cy / (height / 2) - 1) < MAX_CENTRE_OFFSET):
-        raise KeypointError(
-            f"the intrinsics belong to an image of about {2 * cx:.0f}x{2 * cy:.0f} pixels, but this one has "
-            f"{width}x{height}; scale them to it"
-        )
+    _check_resolution(observation)
     depth, note = in_metres(observation.depth)
     if not np.isfinite(depth).any():
         raise KeypointError("the depth image has no reading at all; check the camera's depth stream")
-    stride = -(-max(depth.shape) // MAX_EDGE_PX)
+    stride = max(1, max(depth.shape) // MIN_EDGE_PX)
     usable = steady(depth)[::stride, ::stride]
     pixels = np.argwhere(usable)[:, ::-1] * stride
     if len(pixels) < MIN_STEADY_PIXELS:
@@ -96,35 +116,60 @@ def make_view(
         raise KeypointError(
             f"only {inside.sum()} points of the image lie in the workspace; check it and the camera's pose"
         )
-    points, pixels = points[inside], pixels[inside]
+    table = Table.find(points[inside], observation.camera_pose[:3, 3], seed)
+    heights = table.heights(points)
     descriptors = network.describe(observation.rgb)
-    cells = descriptors.cells_at(pixels)
-    at = pixels[:, 1], pixels[:, 0]
-    colours = np.divide(observation.rgb[at], 255, dtype=np.float32)
-    smoothed = np.divide(uniform_filter(observation.rgb, (SMOOTHING_PX, SMOOTHING_PX, 1))[at], 255, dtype=np.float32)
-    raised = _raised(points, seed)
-    table = TableColour.fit(colours if raised.all() else colours[~raised])
-    unlike_table = (table.distance(smoothed) > MIN_DISTANCE_SMOOTHED) & (table.distance(colours) > MIN_DISTANCE_POINT)
-    flat_object = unlike_table & (descriptors.saliency.flat[cells] > network.salient)
-    kept = np.flatnonzero((raised | flat_object) & (points[:, 2] <= upper[2]))
-    place = tuple(pixels[kept, ::-1].T // stride)
-    mask = np.zeros_like(usable)
-    mask[place] = True
-    gap = SEGMENT_GAP_M * observation.intrinsics[0, 0] / np.nanmedian(depth) / stride
-    labels = label(maximum_filter(mask, size=max(1, round(gap))), structure=np.ones((3, 3)))[0][place]
-    large = np.bincount(labels, minlength=1)[labels] >= MIN_SEGMENT_POINTS
-    kept, labels = kept[large], labels[large]
+    label = np.full(len(points), TABLE)
+    label[_unlike_table(observation, descriptors, pixels, heights, table, network.salient)] = 0
+    label[heights < -table.least_height] = BELOW
+    standing = np.flatnonzero(label == 0)
+    label[standing[table.beside(points[standing])]] = BESIDE
+    label[(label == 0) & (heights > TALLEST_M)] = HIGH
+    label[~inside | ((label == 0) & (points[:, 2] > upper[2]))] = OUTSIDE
+
+    to_world = np.eye(4)
+    if np.arccos(min(table.plane[2], 1.0)) > MIN_TILT_RAD:
+        to_level = levelling(table.plane)
+        points, to_world = points @ to_level[:3, :3].T, invert_pose(to_level)
+        observation = replace(observation, camera_pose=to_level @ observation.camera_pose)
+    footprint = GAP_PX * stride * float(np.nanmedian(depth)) / observation.intrinsics[0, 0]
+    foreground = np.flatnonzero(label == 0)
+    label[foreground] = connected_pieces(points[foreground], max(GAP_M, footprint))
+    _join_hidden(label, points, usable)
+    small = _leave_out(label, heights, pixels)
+
+    kept = np.flatnonzero(label >= 0)
     if len(kept) < MIN_FOREGROUND_POINTS:
         raise KeypointError("nothing stands out from the table in an image; is the object in the workspace?")
-    points, cells = points[kept], cells[kept]
-    xyzrgb = np.concatenate([points, colours[kept] * COLOUR_SCALE_M], axis=1).astype(np.float32)
-    segments = tuple(np.flatnonzero(labels == segment) for segment in np.unique(labels))
-    target = xyzrgb[np.concatenate([subsample(segment, MAX_SEGMENT_POINTS, seed) for segment in segments])]
-    cells, inverse, counts = np.unique(cells, return_inverse=True, return_counts=True)
+    at = pixels[kept, 1], pixels[kept, 0]
+    colours = np.divide(observation.rgb[at], 255, dtype=np.float32)
+    labels = np.full(usable.shape, UNKNOWN, dtype=np.int16)
+    labels[usable] = label
+    points, label = points[kept], label[kept]
+    xyzrgb = np.concatenate([points, colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
+    pieces = tuple(np.flatnonzero(label == piece) for piece in range(label.max() + 1))
+    # Of equal density: near or separate things have no more weight than others.
+    target = xyzrgb[np.unique(np.floor(points / TARGET_M).astype(int), axis=0, return_index=True)[1]]
+    cells, inverse, counts = np.unique(descriptors.cells_at(pixels[kept]), return_inverse=True, return_counts=True)
     cell_points = np.stack([np.bincount(inverse, axis) for axis in points.T], axis=1) / counts[:, None]
     neighbours = np.setdiff1d([descriptors.shifted(cells, row, col) for row, col in NEIGHBOURS], cells)
     cells = np.concatenate([cells, neighbours])
-    return View(observation, descriptors, depth, points, xyzrgb, segments, target, cells, cell_points, note)
+    notes = tuple(line for line in (note, small) if line)
+    return View(
+        observation,
+        descriptors,
+        depth,
+        to_world,
+        points,
+        xyzrgb,
+        pieces,
+        target,
+        cells,
+        cell_points,
+        labels,
+        stride,
+        notes,
+    )
 
 
 def subsample(indices: IntArray, count: int, seed: int) -> IntArray:
@@ -134,13 +179,102 @@ def subsample(indices: IntArray, count: int, seed: int) -> IntArray:
     return np.sort(np.random.default_rng(seed).choice(indices, count, replace=False))
 
 
-def _raised(points: FloatArray, seed: int) -> NDArray[np.bool_]:
-    """Which of ``points (N, 3)`` are higher above the table's plane than its noise."""
-    plane = table_plane(points, seed)
-    height = points @ plane[:3] + plane[3]
-    of_table = np.abs(height)[np.abs(height) < MIN_HEIGHT_M]
-    noise = MAD_TO_DEVIATION * np.median(of_table) if len(of_table) else 0.0
-    return height > max(MIN_HEIGHT_M, MIN_HEIGHT_DEVIATIONS * noise)
+def _check_resolution(observation: Observation) -> None:
+    height, width = observation.depth.shape
+    cx, cy = observation.intrinsics[:2, 2]
+    if not (abs(cx / (width / 2) - 1) < MAX_CENTRE_OFFSET and abs(cy / (height / 2) - 1) < MAX_CENTRE_OFFSET):
+        raise KeypointError(
+            f"the intrinsics belong to an image of about {2 * cx:.0f}x{2 * cy:.0f} pixels, but this one has "
+            f"{width}x{height}; scale them to it"
+        )
+
+
+def _unlike_table(
+    observation: Observation,
+    descriptors: DescriptorMap,
+    pixels: IntArray,
+    heights: FloatArray,
+    table: Table,
+    salient: float,
+) -> NDArray[np.bool_]:
+    """Which of ``pixels (N, 2)`` at ``heights (N,)`` are above the table, or salient and of another colour."""
+    at = pixels[:, 1], pixels[:, 0]
+    raised = heights > table.least_height
+    flat = np.abs(heights) <= table.least_height
+    colours = np.divide(observation.rgb[at], 255, dtype=np.float32)
+    smoothed = np.divide(uniform_filter(observation.rgb, (SMOOTHING_PX, SMOOTHING_PX, 1))[at], 255, dtype=np.float32)
+    colour = TableColour.fit(colours[flat] if flat.any() else colours)
+    unlike = (colour.distance(smoothed) > MIN_DISTANCE_SMOOTHED) & (colour.distance(colours) > MIN_DISTANCE_POINT)
+    return raised | (flat & unlike & (descriptors.saliency.flat[descriptors.cells_at(pixels)] > salient))
+
+
+def connected_pieces(points: FloatArray, gap: float) -> IntArray:
+    """Number ``(N,)`` of the piece of each of ``points (N, 3)``: chains of points less than ``gap`` apart."""
+    if not len(points):
+        return np.zeros(0, dtype=np.intp)
+    _, voxel, counts = np.unique(
+        np.floor(points / (gap / 3)).astype(int), axis=0, return_inverse=True, return_counts=True
+    )
+    voxel = voxel.reshape(-1)
+    centres = np.stack([np.bincount(voxel, axis) for axis in points.T], axis=1) / counts[:, None]
+    a, b = cKDTree(centres).query_pairs(gap, output_type="ndarray").T
+    graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(len(centres), len(centres)))
+    return connected_components(graph, directed=False)[1][voxel].astype(np.intp)
+
+
+def _join_hidden(label: IntArray, points: FloatArray, usable: NDArray[np.bool_]) -> None:
+    """Join the pieces in ``label (N,)`` whose pixels meet and that are near in a horizontal direction.
+
+    ``points (N, 3)`` are those of the ``usable (h, w)`` pixels.
+    """
+    grid = np.full(usable.shape, -1)
+    grid[usable] = np.arange(len(points))
+    joined: list[IntArray] = []
+    for step in range(1, GAP_PX + 1):
+        for a, b in (
+            (grid[:, step:], grid[:, :-step]),
+            (grid[step:], grid[:-step]),
+            (grid[step:, step:], grid[:-step, :-step]),
+            (grid[step:, :-step], grid[:-step, step:]),
+        ):
+            known = (a >= 0) & (b >= 0)
+            one, other = a[known], b[known]
+            apart = (label[one] != label[other]) & (label[one] >= 0) & (label[other] >= 0)
+            one, other = one[apart], other[apart]
+            near = np.linalg.norm((points[one] - points[other])[:, :2], axis=1) < HIDDEN_GAP_M
+            joined.append(np.stack([label[one[near]], label[other[near]]], axis=1))
+    a, b = np.concatenate(joined).T
+    count = label.max() + 1
+    graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
+    label[label >= 0] = connected_components(graph, directed=False)[1][label[label >= 0]]
+
+
+def _leave_out(label: IntArray, heights: FloatArray, pixels: IntArray) -> str:
+    """Mark in ``label (N,)`` the pieces that are too small or reach in over the border; number the others from 0.
+
+    Returns a line that tells where things are that are too small, or nothing.
+    """
+    first, last = pixels.min(axis=0), pixels.max(axis=0)
+    margin = np.maximum((last - first) * BORDER_SHARE, 1)
+    at_border = ((pixels < first + margin) | (pixels > last - margin)).any(axis=1)
+    number, small = 0, []
+    for piece in np.unique(label[label >= 0]):
+        members = np.flatnonzero(label == piece)
+        if MIN_TOLD_POINTS <= len(members) < MIN_FOREGROUND_POINTS and heights[members].min() > 0:
+            small.append("({:.0f}, {:.0f})".format(*pixels[members].mean(axis=0)))
+        crossing = heights[members][at_border[members]]
+        if len(members) < MIN_PIECE_POINTS:
+            label[members] = SMALL
+        elif len(crossing) and crossing.min() > HOVERING_M:
+            label[members] = BORDER
+        else:
+            label[members] = number
+            number += 1
+    if not small:
+        return ""
+    return (
+        f"too small for keypoints: what is at pixel {', '.join(small[:MAX_TOLD])}; take larger or nearer images of it"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,7 +87,7 @@ def build_context(
         settings.seed,
         settings.descriptors,
         settings.keypoints,
-    ).fit([demonstration.observation for demonstration in demonstrations])
+    ).fit([one.observation for one in demonstrations], [one.trajectory for one in demonstrations])
     given = context_of_keypoints(extractor.keypoints_, [one.trajectory for one in demonstrations], settings)
     aligned = align(given.trajectories)
     views = [View.of(demonstrations[index].observation) for index in aligned.kept]

@@ -27,6 +27,10 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
     if observation.rgb.shape != scenery.reference.rgb.shape:
         old, new = scenery.reference.rgb.shape, observation.rgb.shape
         words = f"the image has {new[1]}x{new[0]} pixels, the demonstrations' have {old[1]}x{old[0]}"
+        if change.within_calibration:
+            advice = ": one was cropped; subtract what was cut on the left and at the top from the principal point"
+            numbers = {"intrinsics": change.intrinsics}
+            return [Finding("camera", "error", f"{words}, with the same intrinsics{advice}", numbers, "cropped image")]
         return [Finding("camera", "warning", f"{words}: scenery was not compared", cause="another resolution")]
     small = change.within_calibration
     like = scenery.likeness(view)

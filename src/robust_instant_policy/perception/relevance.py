@@ -1,0 +1,77 @@
+"""Which objects matter: those that the demonstrations' hand approaches, grasps, or moves relative to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
+
+CONTACT_M = 0.05  # distance of the fingertips at which an object counts 1/e
+RELATED_M = 0.20  # the same for an object relative to which they move
+MIN_SPREAD_M = 0.01  # of the hand's places over demonstrations; less tells nothing of what they depend on
+CLOSED = 0.5  # gripper state
+MIN_RELEVANCE = 0.2  # of the most relevant object's
+STILL_M = 0.010  # by which scenery seems to move between images
+
+
+def relevances(objects: Sequence[Sequence[FloatArray]], trajectories: Sequence[Trajectory]) -> FloatArray:
+    """Relevance ``(O,)`` of ``objects``, each given by its points ``(N, 3)`` in every demonstration, metres, world.
+
+    Over the hand's events (`_events`) the sum of its nearness to the object or, if that is more, of the share of the
+    variance of the hand's place that the object's place explains.
+    """
+    scenes = zip(*objects, strict=True)
+    events = [_events(points, path) for points, path in zip(scenes, trajectories, strict=True)]
+    # The last events of all demonstrations correspond: a repeated attempt comes before them.
+    common = min(len(one) for one in events)
+    hands = np.array([one[-common:] for one in events])
+    return np.array([_relevance(points, hands) for points in objects])
+
+
+def still(points: Sequence[FloatArray]) -> bool:
+    """Whether an object with ``points (N, 3)`` in every image is at the same place in all."""
+    centres = np.array([one.mean(axis=0) for one in points])
+    return bool(len(centres) > 1 and np.linalg.norm(centres - centres[0], axis=1).max() < STILL_M)
+
+
+def shares(weights: FloatArray, count: int) -> list[int]:
+    """``count`` keypoints for objects of ``weights (O,)``, by largest remainders; each of a positive weight has one
+    while there are enough.
+    """
+    given = np.zeros(len(weights), dtype=int)
+    given[np.argsort(-weights, kind="stable")[: min(count, int((weights > 0).sum()))]] = 1
+    while given.sum() < count:
+        given[np.argmax(weights / (given + 0.5))] += 1
+    return given.tolist()
+
+
+def _events(points: Sequence[FloatArray], path: Trajectory) -> FloatArray:
+    """Midpoints of the fingertips ``(E, 3)`` in one demonstration, metres, world: where the hand first comes near an
+    object's ``points (N, 3)``, where the gripper opens or closes, and at the end; of every arm.
+    """
+    nearest = cKDTree(np.concatenate(points))
+    places = []
+    for arm in range(0, path.actions.shape[1], ACTION_DIM):
+        tips = path.actions[:, arm + 3 : arm + 9].reshape(-1, 2, 3).mean(axis=1)
+        distance = nearest.query(tips)[0]
+        changes = np.flatnonzero(np.diff(path.actions[:, arm + STATE_INDEX] > CLOSED)) + 1
+        near = np.flatnonzero(distance < CONTACT_M)
+        first = near[0] if len(near) else int(distance.argmin())
+        places += [tips[first], *tips[changes], tips[-1]]
+    return np.array(places)
+
+
+def _relevance(points: Sequence[FloatArray], hands: FloatArray) -> float:
+    """Of an object with ``points (N, 3)`` in each of I demonstrations, for the hand's places ``hands (I, E, 3)``."""
+    centres = np.array([one.mean(axis=0) for one in points])
+    distance = np.median([cKDTree(one).query(at)[0] for one, at in zip(points, hands, strict=True)], axis=0)
+    near = np.exp(-((distance / CONTACT_M) ** 2))
+    spread = hands.var(axis=0).sum(axis=-1)
+    left = (hands - centres[:, None]).var(axis=0).sum(axis=-1)
+    explained = np.where(spread > MIN_SPREAD_M**2, 1 - left / np.maximum(spread, MIN_SPREAD_M**2), 0)
+    related = np.clip(explained, 0, 1) * np.exp(-((distance / RELATED_M) ** 2))
+    return float(np.maximum(near, related).sum())

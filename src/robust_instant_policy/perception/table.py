@@ -1,0 +1,76 @@
+"""The table in an image: its plane, and where it ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from robust_instant_policy.geometry import FloatArray, make_pose
+from robust_instant_policy.pointcloud import table_plane
+
+MAD_TO_DEVIATION = 1.4826  # standard deviation of a Gaussian with median absolute deviation 1
+MIN_HEIGHT_M = 0.010  # above the table, for points of objects,
+MIN_HEIGHT_DEVIATIONS = 4.0  # or this many standard deviations of the depth noise, if that is more
+BELOW_M = 0.05  # a ray that ends this far under the plane has passed the table
+MIN_BELOW_SHARE = 0.01  # of the image's points: fewer are errors of the depth
+EDGE_MARGIN_M = 0.02  # by which an object may reach over the edge
+MAX_ABOVE_M = 0.8  # of what stands on a table
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """``plane (4,)``: unit normal, upward, and offset; ``noise``: standard deviation of its points, metres;
+    ``on (N, 2)`` and ``off (M, 2)``: places in the plane, metres, where rays meet the table or pass beside it.
+    """
+
+    plane: FloatArray
+    noise: float
+    on: FloatArray
+    off: FloatArray
+
+    @classmethod
+    def find(cls, points: FloatArray, camera: FloatArray, seed: int) -> Table:
+        """The table in ``points (N, 3)`` that a camera at ``camera (3,)`` sees, metres, world."""
+        plane = table_plane(points, seed)
+        heights = points @ plane[:3] + plane[3]
+        near = np.abs(heights)[np.abs(heights) < MIN_HEIGHT_M]
+        noise = float(MAD_TO_DEVIATION * np.median(near)) if len(near) else 0.0
+        below = heights < -max(BELOW_M, MIN_HEIGHT_DEVIATIONS * noise)
+        if below.mean() < MIN_BELOW_SHARE:
+            below[:] = False
+        level = levelling(plane)[:3, :3]
+        camera_height = camera @ plane[:3] + plane[3]
+        share = (camera_height / (camera_height - heights[below]))[:, None]
+        crossings = camera + share * (points[below] - camera)
+        return cls(
+            plane, noise, (points[np.abs(heights) < MIN_HEIGHT_M] @ level.T)[:, :2], (crossings @ level.T)[:, :2]
+        )
+
+    def heights(self, points: FloatArray) -> FloatArray:
+        """Heights ``(N,)`` of ``points (N, 3)`` above the table, metres."""
+        return points @ self.plane[:3] + self.plane[3]
+
+    @property
+    def least_height(self) -> float:
+        """From which a point is above the table, metres."""
+        return max(MIN_HEIGHT_M, MIN_HEIGHT_DEVIATIONS * self.noise)
+
+    def beside(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Which of ``points (N, 3)`` are not above the table: their nearest place that a ray has tested is empty."""
+        if not len(self.off) or not len(self.on):
+            return np.zeros(len(points), dtype=bool)
+        places = (points @ levelling(self.plane)[:3, :3].T)[:, :2]
+        to_table, to_nothing = (
+            cKDTree(tested[:: max(1, len(tested) // 4000)]).query(places)[0] for tested in (self.on, self.off)
+        )
+        return to_table > to_nothing + EDGE_MARGIN_M
+
+
+def levelling(plane: FloatArray) -> FloatArray:
+    """The smallest rotation ``(4, 4)`` that makes the normal of ``plane (4,)`` vertical."""
+    a, b, c, _ = plane
+    cross = np.array([[0, 0, -a], [0, 0, -b], [a, b, 0.0]])
+    return make_pose(np.eye(3) + cross + cross @ cross / (1 + c), [0, 0, 0])
