@@ -64,7 +64,7 @@ class WipeEnv(CellEnv):
         share = float(self.wiped.mean())
         if share >= WIPED_SHARE:
             return ""
-        return f"{share:.0%} of the bar is wiped, {WIPED_SHARE:.0%} wanted"
+        return f"{share:.1%} of the bar is wiped, {WIPED_SHARE:.0%} wanted"
 
 
 def wipe(env: WipeEnv, rng: np.random.Generator) -> list[Stroke]:
