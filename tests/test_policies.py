@@ -182,7 +182,7 @@ SURE = Evidence(
     ids=lambda worse: next(iter(worse)),
 )
 def test_confidence_falls_with_everything_that_speaks_against_a_plan(worse):
-    assert plan_confidence(SURE) > 0.95
+    assert plan_confidence(SURE) > 0.9
     assert plan_confidence(replace(SURE, **worse)) < plan_confidence(SURE) - 0.01
 
 

@@ -34,6 +34,7 @@ NOISE_M = 0.003  # of demonstrated points in a frame that suits them
 # Standard deviations a priori of what is fitted: share of the way; a point in a thing, an offset, its growth in metres.
 SHARE_STD, POINT_STD_M, OFFSET_STD_M, GROWTH_STD_M = 0.7, 0.02, 0.5, 0.1
 PARAMETER_COST = 0.04  # of a fitted number, in logarithms of the error
+USUAL_DEMOS = 10  # for which that cost holds; it is higher for fewer
 TRANSITION_COST = 1.0  # of a change of frame between two steps, in logarithms of the error
 KEY_STEP_WEIGHT = 3.0  # of the first and last step and of gripper changes; 1 elsewhere
 # Expected error of a single demonstration, a metre to a thing that is seen in its own axes, and to one that has none.
@@ -120,7 +121,8 @@ class Errors:
     @property
     def cost(self) -> FloatArray:
         """``(T, M, N)``: the mean logarithm of the error, on which a single bad demonstration has little influence."""
-        return 0.5 * np.log(self.squared + NOISE_M**2).mean(axis=-1) + self.penalty
+        few = max(1.0, USUAL_DEMOS / self.squared.shape[-1])  # a number fitted to few demonstrations misleads more
+        return 0.5 * np.log(self.squared + NOISE_M**2).mean(axis=-1) + few * self.penalty
 
     @property
     def mean_squared(self) -> FloatArray:

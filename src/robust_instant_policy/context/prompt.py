@@ -87,7 +87,7 @@ class Prompt(ABC):
     def notes(self) -> tuple[str, ...]:
         """For the user, one line each: what was inferred that may be wrong."""
         guess = len(self.shown) < DEMOS_TO_TELL_THINGS and any(frame.things != (WORLD,) for frame in self.frames.used)
-        ranks = () if self.frames.order is None else (str(self.frames.order),)
+        ranks = () if self.frames.ranking is None else (str(self.frames.ranking),)
         return (*ranks, *((GUESS_NOTE,) if guess else ()))
 
     def scene_notes(self, keypoints: FloatArray) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from robust_instant_policy.context.choice import choose_frames
 from robust_instant_policy.context.codec import MM
 from robust_instant_policy.context.frames import WORLD_FRAME, Frame
 from robust_instant_policy.context.things import WORLD, Thing, locate
-from robust_instant_policy.context.ways import Order
+from robust_instant_policy.context.ways import Ranking
 from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
@@ -26,7 +26,7 @@ class StepFrames:
     """
 
     arms: tuple[tuple[Frame, ...], ...]
-    order: Order | None = None
+    ranking: Ranking | None = None
 
     @classmethod
     def world(cls, num_steps: int, num_arms: int) -> StepFrames:
@@ -39,13 +39,13 @@ class StepFrames:
         actions: FloatArray,
         key_steps: Sequence[int],
         things: Sequence[Thing],
-        order: Order | None = None,
+        ranking: Ranking | None = None,
     ) -> StepFrames:
-        """The frames in which demonstrations with ``keypoints (I, K, 3)``, named in ``order``, and aligned ``actions
+        """The frames in which demonstrations with ``keypoints (I, K, 3)``, named by ``ranking``, and aligned ``actions
         (I, T, 10·A)`` predict each other best; ``key_steps`` count more (see `choose_frames`)."""
         scene, hands = locate([WORLD, *things], keypoints), hands_of(actions)
         frames = (choose_frames(things, scene, hands[:, :, arm], key_steps) for arm in range(hands.shape[2]))
-        return cls(tuple(map(tuple, frames)), order)
+        return cls(tuple(map(tuple, frames)), ranking)
 
     @property
     def num_arms(self) -> int:
@@ -93,7 +93,7 @@ class StepFrames:
 
     def named(self, keypoints: FloatArray) -> FloatArray:
         """``keypoints (K, 3)`` by the names that they have in the frames."""
-        return keypoints if self.order is None else self.order.renamed(keypoints[None])[0]
+        return keypoints if self.ranking is None else self.ranking.renamed(keypoints[None])[0]
 
     def encode(self, keypoints: FloatArray, actions: FloatArray) -> FloatArray:
         """The numbers ``(T, 10·A)`` of ``actions (T, 10·A)`` in the scene of ``keypoints (K, 3)``."""

@@ -126,11 +126,11 @@ def _located(thing: Thing, keypoints: FloatArray, found: Scene) -> Located:
     return Located(poses[:, :3, :3], poses[:, :3, 3], unit)
 
 
-def find_things(keypoints: FloatArray) -> list[Thing]:
+def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
     """What demonstrations with ``keypoints (I, K, 3)`` consist of: things of several keypoints, then loose points.
 
     Keypoints belong together when their distances are nearly the same in all demonstrations, or keep their ratios. With
-    too few demonstrations to tell, every group of neighbours may be a thing.
+    too few demonstrations to tell, every group of neighbours may be a thing. ``hinges`` are looked for on demand.
     """
     num_demos, num_points = keypoints.shape[:2]
     if num_points == 1:
@@ -149,7 +149,8 @@ def find_things(keypoints: FloatArray) -> list[Thing]:
     taken = {member for thing in scaled for member in thing.members}
     groups = [group for group in clusters if len(group) > 1 and taken.isdisjoint(group)]
     things = _solid(sorted(groups, key=lambda group: -len(group))[:MAX_THINGS], keypoints) + scaled
-    things += _hinged(things, keypoints, tolerance)
+    if hinges:
+        things += _hinged(things, keypoints, tolerance)
     known = {member for thing in things if thing.kind != "scaled" for member in thing.members}
     return things + [Thing("point", (k,)) for k in range(num_points) if k not in known]
 

@@ -43,7 +43,7 @@ class Measure:
 
 
 @dataclass(frozen=True, eq=False)
-class Order:
+class Ranking:
     """Things alike, sorted: ``blocks`` are their keypoints, in the same order in each, ``axis`` what sorts them."""
 
     blocks: tuple[tuple[int, ...], ...]
@@ -59,11 +59,11 @@ class Order:
         middle = np.median(keypoints[:, blocks], axis=2)  # (I, B, 3)
         values = np.concatenate([middle, np.linalg.norm(middle[..., :2], axis=-1, keepdims=True)], axis=-1)
         order = np.argsort(values[..., self.axis], axis=1)
-        sorted_ = keypoints.copy()
-        sorted_[:, blocks.ravel()] = keypoints[
+        renamed = keypoints.copy()
+        renamed[:, blocks.ravel()] = keypoints[
             np.arange(len(keypoints))[:, None], blocks[order].reshape(len(order), -1)
         ]
-        return sorted_
+        return renamed
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,19 +84,19 @@ class Split:
         return int(beyond >= 0), float(min(1.0, abs(beyond) / (self.gap / 2)))
 
 
-def find_order(keypoints: FloatArray, hands: FloatArray) -> Order | None:
+def find_ranking(keypoints: FloatArray, hands: FloatArray) -> Ranking | None:
     """The order by which things alike are meant in demonstrations with ``keypoints (I, K, 3)`` and ``hands (I, T, A, 3,
     3)`` at the key steps; None where their names are as good."""
-    blocks = _alike(find_things(keypoints), keypoints)
+    blocks = _alike(find_things(keypoints, hinges=False))
     if not blocks:
         return None
-    orders = [None, *(Order(blocks, axis) for axis in (3, 1, 0, 2))]
+    rankings = [None, *(Ranking(blocks, axis) for axis in (3, 1, 0, 2))]
     costs = []
-    for order in orders:
-        named = order.renamed(keypoints) if order else keypoints
-        things = find_things(named)
-        costs.append(_cost(_squared(things, locate([WORLD, *things], named), hands)) + RANK_GAIN * bool(order))
-    return orders[int(np.argmin(costs))]
+    for ranking in rankings:
+        named = ranking.renamed(keypoints) if ranking else keypoints
+        things = find_things(named, hinges=False)
+        costs.append(_cost(_squared(things, locate([WORLD, *things], named), hands)) + RANK_GAIN * bool(ranking))
+    return rankings[int(np.argmin(costs))]
 
 
 def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tuple[Split, np.ndarray] | None:
@@ -142,7 +142,7 @@ def _cost(squared: FloatArray) -> float:
     return 0.5 * float(np.log(squared + NOISE_M**2).sum())
 
 
-def _alike(things: Sequence[Thing], keypoints: FloatArray) -> tuple[tuple[int, ...], ...]:
+def _alike(things: Sequence[Thing]) -> tuple[tuple[int, ...], ...]:
     """The most things of the same shape, keypoints in corresponding order; none where fewer than two are alike."""
     solid = [thing for thing in things if thing.kind == "upright" and thing.shape is not None]
     best: tuple[tuple[int, ...], ...] = ()

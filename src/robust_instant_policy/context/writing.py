@@ -14,7 +14,7 @@ from robust_instant_policy.context.prompt import Frames, Layout, Order, Prompt
 from robust_instant_policy.context.sequence import SequencePrompt, raw_rows, sequence_example
 from robust_instant_policy.context.step_frames import StepFrames, hands_of
 from robust_instant_policy.context.things import WORLD, find_things, locate
-from robust_instant_policy.context.ways import find_order, find_split
+from robust_instant_policy.context.ways import find_ranking, find_split
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, Trajectory
@@ -99,15 +99,15 @@ def _sequence(keypoints: FloatArray, aligned: AlignedDemonstrations, frames: Fra
 def _adaptive(keypoints: FloatArray, aligned: AlignedDemonstrations, order: Order) -> FactorisedPrompt:
     """One prompt for each way to act, within the prompt of the way that more demonstrations go."""
     hands = hands_of(aligned.actions[:, list(aligned.key_steps)])
-    ranks = find_order(keypoints, hands)
-    named = keypoints if ranks is None else ranks.renamed(keypoints)
+    ranking = find_ranking(keypoints, hands)
+    named = keypoints if ranking is None else ranking.renamed(keypoints)
     things = find_things(named)
     found = find_split(things, locate([WORLD, *things], named), hands)
     sides = [np.ones(len(named), dtype=bool)] if found is None else [~found[1], found[1]]
     ways = []
     for side in sides:
         shown = np.flatnonzero(side)
-        chosen = StepFrames.adaptive(named[shown], aligned.actions[shown], aligned.key_steps, things, ranks)
+        chosen = StepFrames.adaptive(named[shown], aligned.actions[shown], aligned.key_steps, things, ranking)
         ways.append(_factorised(chosen, keypoints, aligned, shown, True, order))
     if found is None:
         return ways[0]

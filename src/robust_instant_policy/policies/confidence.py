@@ -19,8 +19,8 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
-    "constant": 3.21, "distortion": 0.92, "prediction": 1.23, "novelty": 1.33, "displacement": 1.33, "precision": 1.8,
-    "doubts": 4.19, "warnings": 0.83,
+    "constant": 2.92, "distortion": 0.79, "prediction": 0.62, "novelty": 1.47, "displacement": 0.96,
+    "precision": 1.19, "doubts": 3.68, "warnings": 0.77,
 }  # fmt: skip
 UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
 
