@@ -14,6 +14,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity import Finding
@@ -147,10 +149,11 @@ def _squared_distance(rows: FloatArray, row: FloatArray) -> float:
 
 
 def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
-    """How far distances between keypoints differ from the demonstrations', where these preserve them.
+    """How far distances between keypoints of one thing differ from the demonstrations', of the worst thing.
 
-    The upper quartile of the differences from the median, over their variation, and over the demonstrations' own: above
-    1 they differ by more than usual. ``demonstrated (I, K, 3)`` and ``keypoints (K, 3)`` in metres; NaN for fewer than
+    A thing is a set of keypoints joined by distances that the demonstrations preserve. For each: the upper quartile of
+    the differences from the median distances, over their variation, and over the demonstrations' own quartile; above 1
+    they differ by more than usual. ``demonstrated (I, K, 3)`` and ``keypoints (K, 3)`` in metres; NaN for fewer than
     `MIN_SCENES`, or where no distance is preserved.
     """
     if len(demonstrated) < MIN_SCENES:
@@ -158,19 +161,24 @@ def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
     pairs = np.triu_indices(len(keypoints), 1)
     shown, new = (np.linalg.norm((p[..., :, None, :] - p[..., None, :, :]), axis=-1) for p in (demonstrated, keypoints))
     shown, new = shown[:, *pairs], new[pairs]
+    variation = _variation(shown)
+    rigid = variation < RIGID_M
+    _, thing = connected_components(coo_array((rigid, pairs), shape=(len(keypoints),) * 2), directed=False)
 
-    def differences(distances: FloatArray, others: FloatArray) -> FloatArray:
-        middle = np.median(others, axis=0)
-        variation = 1.4826 * np.median(np.abs(others - middle), axis=0)
-        off = np.abs(distances - middle) / np.maximum(variation, DISTANCE_M)
-        return off[variation < RIGID_M]
+    def quartiles(distances: FloatArray, others: FloatArray) -> FloatArray:
+        off = np.abs(distances - np.median(others, axis=0)) / np.maximum(_variation(others), DISTANCE_M)
+        return np.array([np.quantile(off[rigid & (thing[pairs[0]] == one)], 0.75) for one in things])
 
-    own = [differences(row, np.delete(shown, index, axis=0)) for index, row in enumerate(shown)]
-    found = differences(new, shown)
-    if not len(found):
+    things = np.unique(thing[pairs[0]][rigid])
+    if not len(things):
         return float("nan")
-    usual = np.median([np.quantile(off, 0.75) for off in own if len(off)])
-    return float(np.quantile(found, 0.75) / max(float(usual), 1.0))
+    usual = np.median([quartiles(row, np.delete(shown, index, axis=0)) for index, row in enumerate(shown)], axis=0)
+    return float((quartiles(new, shown) / np.maximum(usual, 1.0)).max())
+
+
+def _variation(values: FloatArray) -> FloatArray:
+    """Robust standard deviation over the first axis."""
+    return 1.4826 * np.asarray(np.median(np.abs(values - np.median(values, axis=0)), axis=0))
 
 
 def recognition(keypoint_confidence: FloatArray) -> float:
