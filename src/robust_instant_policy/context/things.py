@@ -25,6 +25,8 @@ LEAST_SWING_RAD = 0.2  # a part that turns less than this shows no hinge
 LEAST_SCALED = 4  # keypoints of a thing of varying size: two define it
 SIZE_EXPLAINS = 0.7  # relative spread of distances when divided by the size, below which a thing has one
 MAX_THINGS = 4  # of several keypoints: those of the most keypoints
+MIRRORED_DEMOS = 2  # in which a thing has the other hand: a single one may be an error
+MIRROR = np.array([1.0, -1.0, 1.0])
 MAD_TO_STD = 1.4826
 
 Kind = Literal["world", "point", "upright", "rigid", "scaled", "hinged"]
@@ -47,20 +49,23 @@ class Thing:
 
     A ``point`` keeps the world's axes. Others turn with the keypoints ``members`` whose positions in the thing are
     ``shape (N, 3)``: ``upright`` about the vertical, ``rigid`` in all directions, ``scaled`` about the vertical with a
-    size that differs from scene to scene, ``hinged`` about the axis of ``hinge``. The ``world`` has no members.
+    size that differs from scene to scene, ``hinged`` about the axis of ``hinge``. The ``world`` has no members. A thing
+    that ``mirrors`` is seen in either hand, as a left and a right shoe: its shape or that with the opposite y.
     """
 
     kind: Kind
     members: tuple[int, ...] = ()
     shape: FloatArray | None = None
     hinge: Hinge | None = None
+    mirrors: bool = False
 
     def __str__(self) -> str:
         if self.kind == "world":
             return "the world"
         names = ("keypoint " if len(self.members) == 1 else "keypoints ") + _ranges(self.members)
         if self.hinge is None:
-            return names + {"rigid": " (in space)", "scaled": " (of any size)"}.get(self.kind, "")
+            hand = " (of either hand)" if self.mirrors else ""
+            return names + {"rigid": " (in space)", "scaled": " (of any size)"}.get(self.kind, "") + hand
         share = "" if self.hinge.share == 1 else f"{self.hinge.share:.0%} of the angle of "
         return f"{share}{names}, hinged to {self.hinge.base}"
 
@@ -71,15 +76,17 @@ class Thing:
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """A thing in I scenes: ``rotation (I, 3, 3)``, ``position (I, 3)`` and relative ``size (I,)``."""
+    """A thing in I scenes: ``rotation (I, 3, 3)``, ``position (I, 3)``, relative ``size (I,)``, and ``hand (I,)``, -1
+    where it is mirrored, else 1."""
 
     rotation: FloatArray
     position: FloatArray
     size: FloatArray
+    hand: FloatArray
 
     def of(self, scenes: np.ndarray) -> Located:
         """The thing in those of the ``scenes`` alone."""
-        return Located(self.rotation[scenes], self.position[scenes], self.size[scenes])
+        return Located(self.rotation[scenes], self.position[scenes], self.size[scenes], self.hand[scenes])
 
     def point(self, offset: FloatArray) -> FloatArray:
         """``(I, 3)``, the world positions of the point ``offset (3,)`` of the thing."""
@@ -105,10 +112,10 @@ def _located(thing: Thing, keypoints: FloatArray, found: Scene) -> Located:
     count = len(keypoints)
     still, unit = np.tile(np.eye(3), (count, 1, 1)), np.ones(count)
     if thing.kind == "world":
-        return Located(still, np.zeros((count, 3)), unit)
+        return Located(still, np.zeros((count, 3)), unit, unit)
     points = keypoints[:, list(thing.members)]
     if thing.kind == "point":
-        return Located(still, points[:, 0], unit)
+        return Located(still, points[:, 0], unit, unit)
     assert thing.shape is not None
     if thing.hinge is not None:
         hinge, base = thing.hinge, found[thing.hinge.base]
@@ -116,14 +123,14 @@ def _located(thing: Thing, keypoints: FloatArray, found: Scene) -> Located:
         origin = base.point(hinge.point)
         turned = _complex((points - origin[:, None]) @ axis)
         angle = np.angle((np.conj(_complex(thing.shape)) * turned).sum(axis=1))
-        return Located(axis @ rotations_about_vertical(hinge.share * angle), origin, unit)
+        return Located(axis @ rotations_about_vertical(hinge.share * angle), origin, unit, unit)
     if thing.kind == "scaled":
         middle = points.mean(axis=1)
         ratio = (np.conj(_complex(thing.shape)) * _complex(points - middle[:, None])).sum(axis=1)
         ratio = ratio / (np.abs(_complex(thing.shape)) ** 2).sum()
-        return Located(rotations_about_vertical(np.angle(ratio)), middle, np.abs(ratio))
-    poses = robust_fit(thing.shape, points, upright=thing.kind == "upright")
-    return Located(poses[:, :3, :3], poses[:, :3, 3], unit)
+        return Located(rotations_about_vertical(np.angle(ratio)), middle, np.abs(ratio), unit)
+    poses, hand, _ = _fit_either_hand(thing.shape, points, thing.kind == "upright", thing.mirrors)
+    return Located(poses[:, :3, :3], poses[:, :3, 3], unit, hand)
 
 
 def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
@@ -140,7 +147,7 @@ def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
         tree = linkage(squareform(np.median(distances, axis=0), checks=False), "average")
         nodes = to_tree(tree, rd=True)[1]
         groups = [tuple(sorted(node.pre_order())) for node in nodes if not node.is_leaf()]
-        return [*_solid(groups, keypoints), *(Thing("point", (k,)) for k in range(num_points))]
+        return [*_solid(groups, keypoints, RIGID_SPREAD_M[1]), *(Thing("point", (k,)) for k in range(num_points))]
     varies = spread(distances)
     least = np.median(np.where(np.eye(num_points, dtype=bool), np.inf, varies).min(axis=1))
     tolerance = float(np.clip(RIGID_SPREADS * least, *RIGID_SPREAD_M))
@@ -148,7 +155,7 @@ def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
     scaled = [thing for thing in _scaled(keypoints, tolerance) if _outnumbers(thing.members, clusters)]
     taken = {member for thing in scaled for member in thing.members}
     groups = [group for group in clusters if len(group) > 1 and taken.isdisjoint(group)]
-    things = _solid(sorted(groups, key=lambda group: -len(group))[:MAX_THINGS], keypoints) + scaled
+    things = _solid(sorted(groups, key=lambda group: -len(group))[:MAX_THINGS], keypoints, tolerance) + scaled
     if hinges:
         things += _hinged(things, keypoints, tolerance)
     known = {member for thing in things if thing.kind != "scaled" for member in thing.members}
@@ -166,10 +173,14 @@ def _outnumbers(members: tuple[int, ...], clusters: Sequence[tuple[int, ...]]) -
     return all(set(cluster) < set(members) for cluster in clusters if not set(cluster).isdisjoint(members))
 
 
-def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray) -> list[Thing]:
-    things = [Thing("upright", group, _mean_shape(keypoints[:, list(group)], True)) for group in groups]
-    flat = [group for group in groups if len(group) >= 3]
-    return things + [Thing("rigid", group, _mean_shape(keypoints[:, list(group)], False)) for group in flat]
+def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray, tolerance: float) -> list[Thing]:
+    things = []
+    for kind, size in (("upright", 2), ("rigid", 3)):
+        for group in groups:
+            if len(group) >= size:
+                shape, mirrors = _mean_shape(keypoints[:, list(group)], kind == "upright", tolerance)
+                things.append(Thing(kind, group, shape, mirrors=mirrors))
+    return things
 
 
 def _scaled(keypoints: FloatArray, tolerance: float) -> list[Thing]:
@@ -200,7 +211,7 @@ def _scaled(keypoints: FloatArray, tolerance: float) -> list[Thing]:
         relative = distances * (size.mean() / size)[:, None, None]
         if spread(relative).sum() < SIZE_EXPLAINS * spread(distances).sum():
             unit = points * (size.mean() / size)[:, None, None]
-            things.append(Thing("scaled", members, _mean_shape(unit, True)))
+            things.append(Thing("scaled", members, _mean_shape(unit, True, np.inf)[0]))
     return things
 
 
@@ -302,17 +313,38 @@ def spread(values: FloatArray) -> FloatArray:
     return MAD_TO_STD * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
 
 
-def _mean_shape(points: FloatArray, upright: bool) -> FloatArray:
-    """The centred shape ``(N, 3)`` of which ``points (I, N, 3)`` are noisy, moved copies."""
+def _mean_shape(points: FloatArray, upright: bool, tolerance: float) -> tuple[FloatArray, bool]:
+    """The centred shape ``(N, 3)`` of which ``points (I, N, 3)`` are noisy, moved copies, and whether it ``mirrors``.
+
+    A reflection keeps all distances, but no motion leads to it: the fit is then off by more than ``tolerance``, metres.
+    """
     distances = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
     typical = int(np.argmin(np.abs(distances - np.median(distances, axis=0)).sum(axis=(1, 2))))
     shape = points[typical] - points[typical].mean(axis=0)
+    _, _, off = _fit_either_hand(shape, points, upright, mirrors=True)
+    mirrored = (off[0] > tolerance) & (off[1] < off[0] / 2)
+    mirrors = mirrored.sum() >= MIRRORED_DEMOS
     for _ in range(2):
-        poses = robust_fit(shape, points, upright)
+        poses, hand, _ = _fit_either_hand(shape, points, upright, mirrors)
         back = (points - poses[:, None, :3, 3]) @ poses[:, :3, :3]
+        back[..., 1] *= hand[:, None]
         shape = np.median(back, axis=0)
         shape = shape - shape.mean(axis=0)
-    return shape
+    return shape, bool(mirrors)
+
+
+def _fit_either_hand(
+    shape: FloatArray, points: FloatArray, upright: bool, mirrors: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Poses ``(I, 4, 4)`` as of `robust_fit`, the hand ``(I,)``, -1 where the mirrored shape fits better, and the root
+    mean square distances ``(H, I)``, metres, of the points from the shape and from the mirrored one if it ``mirrors``.
+    """
+    shapes = [shape, shape * MIRROR] if mirrors else [shape]
+    fits = np.stack([robust_fit(own, points, upright) for own in shapes])
+    fitted = np.stack([_moved(poses, own) for poses, own in zip(fits, shapes, strict=True)])
+    off = np.sqrt(_squared(fitted - points).mean(axis=-1))
+    best = off.argmin(axis=0)
+    return fits[best, np.arange(len(points))], 1.0 - 2.0 * best, off
 
 
 def _moved(poses: FloatArray, points: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from operator import attrgetter
 import numpy as np
 
 from robust_instant_policy.context.choice import NOISE_M, Candidates, prediction_errors
-from robust_instant_policy.context.things import WORLD, Located, Scene, Thing, find_things, locate
+from robust_instant_policy.context.things import MAX_THINGS, WORLD, Located, Scene, Thing, find_things, locate
 from robust_instant_policy.geometry import FloatArray, fit_upright
 
 RANK_GAIN, SPLIT_GAIN = 1.0, 1.0  # sums of logarithms of the errors at key steps by which an explanation must be better
@@ -44,26 +44,42 @@ class Measure:
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """Things alike, sorted: ``blocks`` are their keypoints, in the same order in each, ``axis`` what sorts them."""
+    """Things alike, sorted by the coordinate ``axis`` (x, y, z), or else by the distance from the keypoints ``origin``,
+    which is the robot where there are none. ``blocks`` are the keypoints of each, in corresponding order."""
 
     blocks: tuple[tuple[int, ...], ...]
-    axis: int
+    axis: int | None = None
+    origin: tuple[int, ...] = ()
 
     def __str__(self) -> str:
-        by = ("x", "y", "z", "distance from the robot")[self.axis]
+        by = f"distance from {Thing('point', self.origin) if self.origin else 'the robot'}"
+        if self.axis is not None:
+            by = "xyz"[self.axis]
         return f"the {len(self.blocks)} things alike are told apart by their {by}"
+
+    def values(self, keypoints: FloatArray) -> FloatArray:
+        """What sorts the B things in the scenes of ``keypoints (I, K, 3)``: ``(I, B)``."""
+        middle = np.median(keypoints[:, np.array(self.blocks)], axis=2)  # (I, B, 3)
+        if self.axis is not None:
+            return middle[..., self.axis]
+        if self.origin:
+            middle = middle - np.median(keypoints[:, list(self.origin)], axis=1)[:, None]
+        return np.linalg.norm(middle[..., :2], axis=-1)
 
     def renamed(self, keypoints: FloatArray) -> FloatArray:
         """``keypoints (I, K, 3)`` with those of the first thing in order first."""
         blocks = np.array(self.blocks)
-        middle = np.median(keypoints[:, blocks], axis=2)  # (I, B, 3)
-        values = np.concatenate([middle, np.linalg.norm(middle[..., :2], axis=-1, keepdims=True)], axis=-1)
-        order = np.argsort(values[..., self.axis], axis=1)
+        order = np.argsort(self.values(keypoints), axis=1)
         renamed = keypoints.copy()
         renamed[:, blocks.ravel()] = keypoints[
             np.arange(len(keypoints))[:, None], blocks[order].reshape(len(order), -1)
         ]
         return renamed
+
+    def margin(self, keypoints: FloatArray) -> float:
+        """The least difference of two things in a scene, in standard deviations of what sorts them."""
+        values = np.sort(self.values(keypoints), axis=1)
+        return float(np.diff(values, axis=1).min() / values.std())
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,16 +103,23 @@ class Split:
 def find_ranking(keypoints: FloatArray, hands: FloatArray) -> Ranking | None:
     """The order by which things alike are meant in demonstrations with ``keypoints (I, K, 3)`` and ``hands (I, T, A, 3,
     3)`` at the key steps; None where their names are as good."""
-    blocks = _alike(find_things(keypoints, hinges=False))
+    things = find_things(keypoints, hinges=False)
+    blocks = _alike(things)
     if not blocks:
         return None
-    rankings = [None, *(Ranking(blocks, axis) for axis in (3, 1, 0, 2))]
-    costs = []
+    ranked = {member for block in blocks for member in block}
+    others = [
+        thing.members for thing in things if thing.kind in ("upright", "point") and ranked.isdisjoint(thing.members)
+    ]
+    rankings = [Ranking(blocks), *(Ranking(blocks, axis) for axis in range(3))]
+    rankings += [Ranking(blocks, origin=members) for members in others[:MAX_THINGS]]
+    best, least = None, _cost(_squared(things, locate([WORLD, *things], keypoints), hands)) - RANK_GAIN
     for ranking in rankings:
-        named = ranking.renamed(keypoints) if ranking else keypoints
-        things = find_things(named, hinges=False)
-        costs.append(_cost(_squared(things, locate([WORLD, *things], named), hands)) + RANK_GAIN * bool(ranking))
-    return rankings[int(np.argmin(costs))]
+        named = ranking.renamed(keypoints)
+        cost = _cost(_squared(things, locate([WORLD, *things], named), hands)) - min(ranking.margin(keypoints), 1.0)
+        if cost < least:
+            best, least = ranking, cost
+    return best
 
 
 def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tuple[Split, np.ndarray] | None:
@@ -107,17 +130,14 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
     if demos < 2 * LEAST_OF_A_WAY or single.max() < SINGLE_ERROR_M**2:
         return None
     splits: dict[bytes, list[tuple[float, Split, np.ndarray]]] = {}
-    for measure in _measures(things):
+    for measure, threshold, gap in _cuts(things, scene):
         values = measure.value(scene)
-        ordered = np.sort(values)[LEAST_OF_A_WAY - 1 : demos - LEAST_OF_A_WAY + 1]
-        for low, high in pairwise(ordered):
-            gap, deviation = float(high - low), float(values.std())
-            if min(gap, deviation / 4) > NOISE_M:
-                side = values > (low + high) / 2
-                key = (side if side[0] else ~side).tobytes()
-                split = Split(measure, float(low + high) / 2, gap)
-                margin = gap / deviation / np.sqrt(len(measure.things))
-                splits.setdefault(key, []).append((margin, split, side))
+        side, deviation = values > threshold, float(values.std())
+        enough = LEAST_OF_A_WAY <= side.sum() <= demos - LEAST_OF_A_WAY
+        if enough and min(gap, deviation / 4) > NOISE_M:
+            key = (side if side[0] else ~side).tobytes()
+            margin = gap / deviation / np.sqrt(len(measure.things))
+            splits.setdefault(key, []).append((margin, Split(measure, threshold, gap), side))
     best: tuple[float, Split, np.ndarray] | None = None
     for same in splits.values():
         margin, split, side = max(same, key=lambda one: one[0])
@@ -171,32 +191,56 @@ def _matched(shape: FloatArray | None, other: FloatArray | None) -> tuple[int, .
     return tuple(map(int, orders[best])) if difference[best] < ALIKE_M else None
 
 
-def _measures(things: Sequence[Thing]) -> list[Measure]:
-    """What may decide: where things are, how they are turned, their size, and how two or three lie to each other."""
+def _cuts(things: Sequence[Thing], scene: Scene) -> list[tuple[Measure, float, float]]:
+    """All measures, each with a threshold between two neighbouring demonstrations in ``scene`` and their distance.
+
+    An angle has no first and last value: it is cut by a line, on one side of which it lies or on the other.
+    """
+    numbers, angles = _measures(things)
+    found = []
+    for measure in numbers:
+        ordered = np.sort(measure.value(scene))
+        found += [(measure, float(low + high) / 2, float(high - low)) for low, high in pairwise(ordered)]
+    for measure in angles:
+        ordered = np.sort(measure.value(scene) % np.pi)
+        for low, high in pairwise([*ordered, ordered[0] + np.pi]):
+            line = float(low + high) / 2
+            words = f"the side of {np.degrees(line) % 180:.0f}° on which {measure.words} lies"
+            beyond = Measure(words, measure.things, partial(_beyond, measure.function, line))
+            found.append((beyond, 0.0, float(high - low)))
+    return found
+
+
+def _measures(things: Sequence[Thing]) -> tuple[list[Measure], list[Measure]]:
+    """What may decide, numbers and angles in radians: where things are, how they are turned, their size and hand, and
+    how two or three lie to each other."""
     own = [thing for thing in things if thing.kind in ("upright", "scaled")]
     taken = {member for thing in own for member in thing.members}
     points = [thing for thing in things if thing.kind == "point" and taken.isdisjoint(thing.members)]
     own += points if len(own) + len(points) <= 4 else []
-    found: list[Measure] = []
+    numbers: list[Measure] = []
     for a in own:
-        found += [Measure(f"{name} of {a}", (a,), place) for name, place in _PLACES.items()]
-        if a.turns:
-            found.append(Measure(f"the turn of {a}", (a,), _yaw))
+        numbers += [Measure(f"{name} of {a}", (a,), place) for name, place in _PLACES.items()]
         if a.kind == "scaled":
-            found.append(Measure(f"the size of {a}", (a,), attrgetter("size")))
+            numbers.append(Measure(f"the size of {a}", (a,), attrgetter("size")))
+        if a.mirrors:
+            numbers.append(Measure(f"which hand {a} is", (a,), attrgetter("hand")))
     for a, b in combinations(own, 2):
-        found += [
+        numbers += [
             Measure(f"{name} of {a} minus that of {b}", (a, b), partial(_difference, place))
             for name, place in _PLACES.items()
         ]
-    for a, b in permutations(own, 2):
-        if a.turns:
-            found.append(Measure(f"how far {b} is along the x axis of {a}", (a, b), _ahead))
-            found.append(Measure(f"how far {b} is along the y axis of {a}", (a, b), _aside))
     for parts in combinations(own, 3):
         words = "the side of the line from {} to {} on which {} is".format(*parts)
-        found.append(Measure(words, parts, _side))
-    return found
+        numbers.append(Measure(words, parts, _side))
+    turning = [thing for thing in own if thing.turns]
+    angles = [Measure(f"the turn of {a}", (a,), _yaw) for a in turning]
+    angles += [
+        Measure(f"the direction from {a} to {b} in its axes", (a, b), _bearing)
+        for a, b in permutations(own, 2)
+        if a.turns
+    ]
+    return numbers, angles
 
 
 def _difference(place: Callable[[Located], FloatArray], at: Located, other: Located) -> FloatArray:
@@ -212,12 +256,15 @@ def _yaw(at: Located) -> FloatArray:
     return np.arctan2(at.rotation[:, 1, 0], at.rotation[:, 0, 0])
 
 
-def _ahead(at: Located, other: Located) -> FloatArray:
-    return ((other.position - at.position) * at.rotation[:, :, 0]).sum(axis=1)
+def _bearing(at: Located, other: Located) -> FloatArray:
+    """Angle about the vertical, radians, of the direction to the other in the thing's axes."""
+    away = ((other.position - at.position)[:, None] @ at.rotation)[:, 0]
+    return np.arctan2(away[:, 1], away[:, 0])
 
 
-def _aside(at: Located, other: Located) -> FloatArray:
-    return ((other.position - at.position) * at.rotation[:, :, 1]).sum(axis=1)
+def _beyond(angle: Callable[..., FloatArray], line: float, *at: Located) -> FloatArray:
+    """How far, radians, a line through the angle ``line`` is from the angle, positive on its left."""
+    return np.arcsin(np.sin(angle(*at) - line))
 
 
 def _side(a: Located, b: Located, c: Located) -> FloatArray:
