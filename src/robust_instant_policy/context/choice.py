@@ -77,6 +77,12 @@ class Candidates:
         ways = [(ends, grows) for ends in (*singles, *pairs) for grows in dict.fromkeys(((), growing))]
         return cls(scene, tuple(axes), tuple(ways), growing)
 
+    def members(self, index: int) -> set[tuple[int, ...]]:
+        """The keypoints of each thing on which combination ``index`` of M·N depends."""
+        m, n = divmod(index, len(self.origins))
+        things = [*self.origins[n][0], *(end.thing for end in self.axes[m].ends)]
+        return {thing.members for thing in things if thing is not WORLD}
+
     def start(self, home: FloatArray) -> FloatArray:
         """o ``(N, I, 3)`` of each origin; the world's is ``home (3,)``."""
         first = np.stack([self.scene[ends[0]].position for ends, _ in self.origins])

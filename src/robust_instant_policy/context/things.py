@@ -175,7 +175,8 @@ def _outnumbers(members: tuple[int, ...], clusters: Sequence[tuple[int, ...]]) -
 
 def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray, tolerance: float) -> list[Thing]:
     things = []
-    for kind, size in (("upright", 2), ("rigid", 3)):
+    kinds: tuple[tuple[Kind, int], ...] = (("upright", 2), ("rigid", 3))
+    for kind, size in kinds:
         for group in groups:
             if len(group) >= size:
                 shape, mirrors = _mean_shape(keypoints[:, list(group)], kind == "upright", tolerance)

@@ -124,38 +124,59 @@ def find_ranking(keypoints: FloatArray, hands: FloatArray) -> Ranking | None:
 
 def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tuple[Split, np.ndarray] | None:
     """What parts demonstrations in ``scene`` with ``hands (I, T, A, 3, 3)`` at the key steps, and which side ``(I,)``
-    each is on (True: the second); None where one way explains them as well."""
+    each is on (True: the second); None where one way explains them as well.
+
+    Of several measures that part them alike, the one with the widest gap decides. Measures of other things than those
+    to which the hand moves, at the step that one way explains worst, need a wider one.
+    """
     demos = len(hands)
     single = _squared(things, scene, hands)
     if demos < 2 * LEAST_OF_A_WAY or single.max() < SINGLE_ERROR_M**2:
         return None
-    splits: dict[bytes, list[tuple[float, Split, np.ndarray]]] = {}
+    arm, step = np.unravel_index(int(single.argmax()), single.shape)
+    splits: dict[bytes, list[tuple[Split, np.ndarray, float]]] = {}
     for measure, threshold, gap in _cuts(things, scene):
         values = measure.value(scene)
         side, deviation = values > threshold, float(values.std())
         enough = LEAST_OF_A_WAY <= side.sum() <= demos - LEAST_OF_A_WAY
         if enough and min(gap, deviation / 4) > NOISE_M:
             key = (side if side[0] else ~side).tobytes()
-            margin = gap / deviation / np.sqrt(len(measure.things))
-            splits.setdefault(key, []).append((margin, Split(measure, threshold, gap), side))
+            splits.setdefault(key, []).append((Split(measure, threshold, gap), side, gap / deviation))
     best: tuple[float, Split, np.ndarray] | None = None
     for same in splits.values():
-        margin, split, side = max(same, key=lambda one: one[0])
-        squared = np.zeros_like(single)
-        for part in (~side, side):
+        squared, used = np.zeros_like(single), set()
+        for part in (~same[0][1], same[0][1]):
             own = {thing: located.of(part) for thing, located in scene.items()}
-            squared += part.mean() * _squared(things, own, hands[part])
-        cost = _cost(squared) - min(margin, 1.0)
-        if squared.max() < single.max() / 4 and (best is None or cost < best[0]):
-            best = cost, split, side
+            candidates, errors = _errors(things, own, hands[part])
+            squared += part.mean() * _least(errors)
+            used |= candidates.members(int(errors[arm][step].argmin()))
+        if squared.max() >= single.max() / 4:
+            continue
+
+        def margin(one: tuple[Split, np.ndarray, float], used: set[tuple[int, ...]] = used) -> float:
+            measured = {thing.members for thing in one[0].measure.things}
+            return one[2] / np.sqrt(1 + len(measured ^ used))
+
+        widest = max(same, key=margin)
+        cost = _cost(squared) - min(margin(widest), 1.0)
+        if best is None or cost < best[0]:
+            best = cost, widest[0], widest[1]
     return (best[1], best[2]) if best is not None and best[0] + SPLIT_GAIN < _cost(single) else None
 
 
 def _squared(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> FloatArray:
     """Mean squared error ``(A, T)``, square metres, of a demonstration predicted from the others in the best frames."""
+    return _least(_errors(things, scene, hands)[1])
+
+
+def _errors(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tuple[Candidates, list[FloatArray]]:
+    """The candidates, and their mean squared errors ``(T, M, N)`` for each arm."""
     candidates = Candidates.of(things, scene)
-    arms = [prediction_errors(candidates, hands[:, :, arm]).mean_squared for arm in range(hands.shape[2])]
-    return np.stack([errors.min(axis=(1, 2)) for errors in arms])
+    return candidates, [prediction_errors(candidates, hands[:, :, arm]).mean_squared for arm in range(hands.shape[2])]
+
+
+def _least(errors: Sequence[FloatArray]) -> FloatArray:
+    return np.stack([own.min(axis=(1, 2)) for own in errors])
 
 
 def _cost(squared: FloatArray) -> float:
