@@ -77,11 +77,10 @@ class Candidates:
         ways = [(ends, grows) for ends in (*singles, *pairs) for grows in dict.fromkeys(((), growing))]
         return cls(scene, tuple(axes), tuple(ways), growing)
 
-    def members(self, index: int) -> set[tuple[int, ...]]:
-        """The keypoints of each thing on which combination ``index`` of M·N depends."""
-        m, n = divmod(index, len(self.origins))
-        things = [*self.origins[n][0], *(end.thing for end in self.axes[m].ends)]
-        return {thing.members for thing in things if thing is not WORLD}
+    def nearest(self, squared: FloatArray) -> tuple[int, ...]:
+        """The keypoints of the one thing whose frames explain a step with errors ``squared (M, N)`` best."""
+        single = [n for n, (ends, _) in enumerate(self.origins) if len(ends) == 1]
+        return self.origins[single[int(squared[:, single].min(axis=0).argmin())]][0][0].members
 
     def start(self, home: FloatArray) -> FloatArray:
         """o ``(N, I, 3)`` of each origin; the world's is ``home (3,)``."""

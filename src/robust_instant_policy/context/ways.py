@@ -23,7 +23,7 @@ from robust_instant_policy.geometry import FloatArray, fit_upright
 RANK_GAIN, SPLIT_GAIN = 1.0, 1.0  # sums of logarithms of the errors at key steps by which an explanation must be better
 LEAST_OF_A_WAY = 2  # demonstrations
 ALIKE_M = 0.006  # largest difference of the shapes of things that are alike
-SINGLE_ERROR_M = 0.018  # where every key step is predicted better than this, all do the same
+SINGLE_ERROR_M = 0.012  # where every key step is predicted better than this, all do the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
             own = {thing: located.of(part) for thing, located in scene.items()}
             candidates, errors = _errors(things, own, hands[part])
             squared += part.mean() * _least(errors)
-            used |= candidates.members(int(errors[arm][step].argmin()))
+            used.add(candidates.nearest(errors[arm][step]))
         if squared.max() >= single.max() / 4:
             continue
 
