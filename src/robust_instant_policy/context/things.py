@@ -169,8 +169,10 @@ def _clusters(varies: FloatArray, tolerance: float) -> list[tuple[int, ...]]:
 
 
 def _outnumbers(members: tuple[int, ...], clusters: Sequence[tuple[int, ...]]) -> bool:
-    """Whether more keypoints keep their shape than their distances, those that keep their distances among them."""
-    return all(set(cluster) < set(members) for cluster in clusters if not set(cluster).isdisjoint(members))
+    """Whether more keypoints keep their shape than their distances: those that keep their distances are among them, or
+    at most half as many, as neighbours on a thing that hardly grows between them."""
+    touching = [set(cluster) for cluster in clusters if not set(cluster).isdisjoint(members)]
+    return all(own < set(members) or 2 * len(own) <= len(members) for own in touching)
 
 
 def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray, tolerance: float) -> list[Thing]:
