@@ -23,7 +23,7 @@ from robust_instant_policy.geometry import FloatArray, fit_upright
 RANK_GAIN, SPLIT_GAIN = 1.0, 1.0  # sums of logarithms of the errors at key steps by which an explanation must be better
 LEAST_OF_A_WAY = 2  # demonstrations
 ALIKE_M = 0.006  # largest difference of the shapes of things that are alike
-SINGLE_ERROR_M = 0.012  # where every key step is predicted better than this, all do the same
+SINGLE_ERROR_M = 0.015  # where every key step is predicted better than this, all do the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +33,11 @@ class Measure:
     words: str
     things: tuple[Thing, ...]
     function: Callable[..., FloatArray]
+
+    @property
+    def members(self) -> set[tuple[int, ...]]:
+        """The keypoints of each thing."""
+        return {thing.members for thing in self.things}
 
     def value(self, scene: Scene) -> FloatArray:
         return self.function(*(scene[thing] for thing in self.things))
@@ -144,23 +149,20 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
             splits.setdefault(key, []).append((Split(measure, threshold, gap), side, gap / deviation))
     best: tuple[float, Split, np.ndarray] | None = None
     for same in splits.values():
-        squared, used = np.zeros_like(single), set()
+        squared, used = np.zeros_like(single), set[tuple[int, ...]]()
         for part in (~same[0][1], same[0][1]):
             own = {thing: located.of(part) for thing, located in scene.items()}
             candidates, errors = _errors(things, own, hands[part])
             squared += part.mean() * _least(errors)
             used.add(candidates.nearest(errors[arm][step]))
-        if squared.max() >= single.max() / 4:
-            continue
-
-        def margin(one: tuple[Split, np.ndarray, float], used: set[tuple[int, ...]] = used) -> float:
-            measured = {thing.members for thing in one[0].measure.things}
-            return one[2] / np.sqrt(1 + len(measured ^ used))
-
-        widest = max(same, key=margin)
-        cost = _cost(squared) - min(margin(widest), 1.0)
-        if best is None or cost < best[0]:
-            best = cost, widest[0], widest[1]
+            if squared.max() >= single.max() / 4:
+                break
+        else:
+            margins = [gap / np.sqrt(1 + len(split.measure.members ^ used)) for split, _, gap in same]
+            widest = int(np.argmax(margins))
+            cost = _cost(squared) - min(margins[widest], 1.0)
+            if best is None or cost < best[0]:
+                best = cost, same[widest][0], same[widest][1]
     return (best[1], best[2]) if best is not None and best[0] + SPLIT_GAIN < _cost(single) else None
 
 
