@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.context import Prompt, write_prompt
+from robust_instant_policy.context.things import find_things, locate
+from robust_instant_policy.context.ways import find_ranking
 from robust_instant_policy.policies import Neighbours, context_of_keypoints, scene_of_keypoints
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -54,12 +57,43 @@ def test_a_relation_is_inferred_carried_over_and_told_in_words(family, words):
     assert prompt.ways == (prompt,)
 
 
-@pytest.mark.parametrize("family", ["nearest", "side"])
+@pytest.mark.parametrize("family", ["nearest", "side", "mirror", "flip"])
 def test_demonstrations_that_do_different_things_are_told_apart(family):
     keypoints, trajectories, draw = shown(family)
     prompt = write_prompt(keypoints, trajectories)
     assert (errors(prompt, draw) < WITHIN_M).mean() > 0.8
     assert "told apart by" in " ".join(prompt.notes())
+
+
+def test_things_alike_may_be_told_apart_by_their_distance_from_a_third():
+    rng = np.random.default_rng(0)
+    shapes = rng.uniform([-0.04, -0.04, 0], [0.04, 0.04, 0.03], (2, 3, 3))
+    keypoints, hands = [], []
+    for _ in range(10):
+        places = np.pad(rng.uniform([0.3, -0.3], [0.7, 0.3], (3, 2)), (0, 1), constant_values=0)
+        keypoints.append(np.concatenate([shapes[0] + places[0], shapes[0] + places[1], shapes[1] + places[2]]))
+        nearer = np.argmin(np.linalg.norm(places[:2] - places[2], axis=1))
+        hands.append(places[nearer] + shapes[0])
+    noise = rng.normal(0, 0.002, (10, 9, 3))
+    ranking = find_ranking(np.array(keypoints) + noise, np.array(hands)[:, None, None])
+    assert str(ranking) == "the 2 things alike are told apart by their distance from keypoints 6-8"
+
+
+def test_a_mirrored_thing_has_a_hand_and_is_found_in_both():
+    rng = np.random.default_rng(0)
+    shape = rng.uniform([-0.04, -0.04, 0], [0.04, 0.04, 0.03], (5, 3))
+    hand = np.array([1, 1, -1, 1, -1, 1, 1, -1, 1, 1])
+    turns = Rotation.from_rotvec(np.outer(rng.uniform(-3, 3, 10), [0, 0, 1])).as_matrix()
+    mirrored = np.stack([shape * [1, own, 1] for own in hand])
+    keypoints = mirrored @ np.swapaxes(turns, 1, 2) + rng.normal(0, 0.002, (10, 5, 3))
+    thing = find_things(keypoints)[0]
+    located = locate([thing], keypoints)[thing]
+    assert abs(located.hand @ hand) == 10
+    assert np.allclose(np.linalg.det(located.rotation), 1)
+    grasp = turns @ [0.03, 0.0, 0.02]  # on the mirror plane
+    for one in (-1, 1):
+        own = np.einsum("ixy,ix->iy", located.rotation, grasp - located.position)[located.hand == one]
+        assert np.ptp(own, axis=0).max() < 0.01
 
 
 def test_between_two_ways_one_is_followed_whole_and_a_note_says_so():
