@@ -247,7 +247,8 @@ def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) ->
 def _hinge(
     base: Thing, base_at: Located, part_at: Located, points: FloatArray
 ) -> list[tuple[float, Hinge, FloatArray]]:
-    """The part's error (metres) as a part of ``base``, the hinge, and its shape about it; none where nothing swings.
+    """The part's error (metres) as a part of ``base``, the hinge, and its shape about it; none where nothing swings
+    or no axis is in sight.
 
     Relative rotations about one axis have parallel rotation vectors, and their fixed points lie on the axis: a first
     guess, which is then fitted to the part's ``points (I, N, 3)``.
@@ -263,7 +264,11 @@ def _hinge(
     turn = Rotation.from_rotvec(np.outer(swings @ axis, axis)).as_matrix()
     # t_i = c + turn_i (t - c): linear in c and t
     system = np.concatenate([np.eye(3) - turn, turn], axis=2).reshape(-1, 6)
-    center = np.linalg.lstsq(system, position.ravel(), rcond=1e-2)[0][:3]
+    solution = np.linalg.lstsq(system, position.ravel(), rcond=1e-2)[0]
+    off = np.linalg.norm((system @ solution - position.ravel()).reshape(-1, 3), axis=1)
+    if np.median(off) > RIGID_SPREADS * RIGID_SPREAD_M[1]:
+        return []
+    center = solution[:3]
     frame = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])[0]
     local = (points - base_at.position[:, None]) @ base_at.rotation
 

@@ -122,6 +122,7 @@ def find_ranking(keypoints: FloatArray, hands: FloatArray) -> Ranking | None:
     for ranking in rankings:
         named = ranking.renamed(keypoints)
         cost = _cost(_squared(things, locate([WORLD, *things], named), hands)) - min(ranking.margin(keypoints), 1.0)
+        cost += RANK_GAIN * bool(ranking.origin)  # what decides is rather one thing's place than a relation of two
         if cost < least:
             best, least = ranking, cost
     return best
