@@ -56,6 +56,7 @@ from robust_instant_policy.evaluation.work import SceneWork
 from robust_instant_policy.evaluation.workers import MAX_DEATHS, Agenda
 from robust_instant_policy.llm import SampleStore
 from robust_instant_policy.query import Answer, Query
+from robust_instant_policy.reporting.figures import draw, encode
 from robust_instant_policy.reporting.publication import publish
 from robust_instant_policy.reporting.tables import tables
 
@@ -357,6 +358,24 @@ def test_the_papers_numbers_stand_beside_rows_of_its_configuration_only(tmp_path
         assert heads[name][0] == "| method | push-cube | average |"
     assert "Configuration: adaptive" in "".join(heads["table1-adaptive.md"])
     assert set(pq.read_table(tmp_path / "episodes.parquet")["config"].to_pylist()) == {one.config for one in ours}
+
+
+def test_the_papers_numbers_stand_beside_its_own_settings_and_scenes_only(tmp_path):
+    exact = replace(RIP, **PAPER)
+    ours = (exact, replace(exact, queries=2), replace(exact, dof=3.0), replace(exact, demos=5))
+    for level in ("paper", "hard"):
+        rows = [replace(episode(one, 1, True), scene=Scene("push-cube", "seen", 1, level=level)) for one in ours]
+        suite = Suite("table1", ("push-cube",), ours, (1,), level=level)
+        (table, *_) = tables(Summary(suite, rows))
+        beside = [row[2] for row in table.rows] if "paper" in table.head else []
+        assert beside == (["100", "–", "–", "–"] if level == "paper" else [])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_figure_of_many_variants_has_room_for_its_legend_and_its_bars():
+    many = tuple(replace(RIP, queries=queries, model=f"a-model-with-a-long-name-{queries}") for queries in range(2, 32))
+    summary = Summary(Suite("chosen", ("push-cube",), many, (1,)), [episode(one, 1, True) for one in many])
+    assert encode(draw(summary, {}), "png").startswith(b"\x89PNG")
 
 
 def test_the_papers_estimator_fitted_exactly_is_a_row_of_its_own_in_its_configuration():

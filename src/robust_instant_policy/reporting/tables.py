@@ -47,7 +47,7 @@ def success_table(summary: Summary) -> Table:
     configuration.
     """
     ours, variants = reference(summary.variants), summary.variants
-    told = [task for task in summary.tasks if task in paper.TABLE1_TASKS] if paper.is_told(variants) else []
+    told = [task for task in summary.tasks if any(paper.told(summary, one, task) is not None for one in variants)]
     stars = {one.variant: one.mark for one in summary.compare(ours)} if ours is not None else {}
     sets = {variant: summary.of_sets(variant) for variant in summary.variants}
     several = any(len(rates) > 1 for rates in sets.values())
@@ -61,14 +61,14 @@ def success_table(summary: Summary) -> Table:
         for task in summary.tasks:
             row.append(_cell(summary.rate(variant, task), summary.best(task)))
             if task in told:
-                percent = paper.told(variant, task, variants)
+                percent = paper.told(summary, variant, task)
                 row.append(NONE if percent is None else str(percent))
         tried = [task for task in told if summary.rate(variant, task) is not None]
         row.append(_spread(summary, variant, stars.get(variant, "")))
         if several:
             row.append(", ".join(f"{100 * rate:.1f}" for rate in sets[variant].values()))
         if told:
-            row.append(_paper_average(variant, tried, variants))
+            row.append(_paper_average(summary, variant, tried))
         rows.append(tuple(row))
     counts = ", ".join(
         f"{label} {_executions(summary, variant)}"
@@ -245,8 +245,8 @@ def _configuration(variants: Sequence[Variant]) -> str:
     return f"{'; '.join(words)}. " if words else ""
 
 
-def _paper_average(variant: Variant, tasks: Sequence[str], beside: Sequence[Variant]) -> str:
-    rates = [rate for task in tasks if (rate := paper.told(variant, task, beside)) is not None]
+def _paper_average(summary: Summary, variant: Variant, tasks: Sequence[str]) -> str:
+    rates = [rate for task in tasks if (rate := paper.told(summary, variant, task)) is not None]
     return "{:.0f} ± {:.0f}".format(*mean_and_deviation(rates)) if rates else NONE
 
 
@@ -269,7 +269,7 @@ def _with_tests(summary: Summary) -> list[Table]:
 
 def _downsampling(summary: Summary) -> list[Table]:
     table = sweep_table(summary, "downsampling", lambda variant: variant.downsampling)
-    if not paper.is_told(summary.variants):
+    if not paper.is_told(summary):
         return [table]
     told = [str(paper.DOWNSAMPLING[variant.downsampling]) for variant in summary.variants]
     row = ("paper, average of five tasks", *told)
