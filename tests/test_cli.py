@@ -89,6 +89,12 @@ def test_demonstrations_of_another_task_are_refused(workbench, tmp_path, capsys)
     assert "peel-banana" in line
 
 
+def test_keypoints_are_not_compared_with_the_truth_of_another_level(workbench, tmp_path, capsys):
+    demos = str(workbench / "data" / "push-cube")
+    code, line = refused(["keypoints", "--demos", demos, "--level", "hard", "--out", str(tmp_path / "page")], capsys)
+    assert (code, "--level" in line) == (2, True)
+
+
 def test_a_depth_image_of_zeros_is_told(workbench, tmp_path, capsys):
     seen = Observation.load(workbench / "observation.npz")
     blind = Observation(seen.rgb, np.zeros_like(seen.depth), seen.intrinsics, seen.camera_pose)

@@ -378,6 +378,15 @@ def test_a_figure_of_many_variants_has_room_for_its_legend_and_its_bars():
     assert encode(draw(summary, {}), "png").startswith(b"\x89PNG")
 
 
+def test_frames_of_gp_and_the_estimator_mean_decide_what_a_row_is():
+    world = Variant("gp", frames="world")
+    assert world != Variant("gp")
+    assert [Variant("gp", **PAPER).config, Variant("gp", **PAPER | {"frames": "adaptive"}).config] == [
+        "paper", "paper, frames adaptive",
+    ]  # fmt: skip
+    assert Variant("rip", estimator="mean") == Variant("rip-gauss", estimator="mean") == Variant("mean")
+
+
 def test_the_papers_estimator_fitted_exactly_is_a_row_of_its_own_in_its_configuration():
     network = replace(RIP, **PAPER)
     exact = replace(network, estimator="em-number")
