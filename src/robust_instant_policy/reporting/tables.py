@@ -129,7 +129,8 @@ def test_table(summary: Summary) -> Table | None:
 
 def sweep_table(summary: Summary, name: str, value: Callable[[Variant], str]) -> Table:
     """One row a task, one column a value of what is varied."""
-    head = ("task", *(f"{name} = {told}" for told in values(summary.variants, value)))
+    told = zip(summary.variants, values(summary.variants, value), strict=True)
+    head = ("task", *(text if variant.method == "mean" else f"{name} = {text}" for variant, text in told))
     rows = [
         (task, *(_cell(summary.rate(variant, task), summary.best(task)) for variant in summary.variants))
         for task in summary.tasks
