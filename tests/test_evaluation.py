@@ -378,6 +378,19 @@ def test_a_figure_of_many_variants_has_room_for_its_legend_and_its_bars():
     assert encode(draw(summary, {}), "png").startswith(b"\x89PNG")
 
 
+def test_scenes_for_tuning_and_scenes_for_tests_have_tables_of_their_own(tmp_path):
+    seeds = scene_seed(0, 0, "tune"), scene_seed(0, 0, "test")
+    with pytest.raises(RipError, match="100 sets"):
+        first_demonstration_seed(100)
+    suite = Suite("chosen", ("push-cube",), (RIP,), seeds)
+    a_run(tmp_path, suite, [episode(RIP, seed, seed == seeds[0]) for seed in seeds], [])
+    publish(tmp_path)
+    assert "| rip | **100** (21 to 100)" in (tmp_path / "chosen-adaptive-tune.md").read_text()
+    test = (tmp_path / "chosen-adaptive-test.md").read_text()
+    assert "| rip | **0** (0 to 79)" in test
+    assert "marked" not in test  # there is no other method
+
+
 def test_frames_of_gp_and_the_estimator_mean_decide_what_a_row_is():
     world = Variant("gp", frames="world")
     assert world != Variant("gp")

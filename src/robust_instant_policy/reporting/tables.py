@@ -75,15 +75,19 @@ def success_table(summary: Summary) -> Table:
         for variant, label in zip(summary.variants, labels(summary.variants), strict=True)
     )
     over_same = ", the paper's over the same" if told else ""
+    marked = (
+        "RIP is significantly better than those marked \\* or \\*\\* (sign-flip test over scenes, Holm's correction "
+        "for the methods in this table, p < 0.05 and p < 0.005). "
+        if ours is not None and len(variants) > 1
+        else ""
+    )
     by_set = "The averages with each set of demonstrations stand beside them. " if several else ""
     return Table(
         (*head, "average", *(["with each set"] if several else []), *(["paper"] if told else [])),
         tuple(rows),
         f"{_configuration(variants)}Success in percent; in parentheses {INTERVAL}; the best of a task is bold. "
         "Averages are mean ± standard deviation over the tasks that the method was tried in"
-        f"{over_same}. {by_set}RIP is "
-        "significantly better than those marked \\* or \\*\\* (sign-flip test over scenes, Holm's correction for the "
-        f"methods in this table, p < 0.05 and p < 0.005). Executions a task: {counts}.",
+        f"{over_same}. {by_set}{marked}Executions a task: {counts}.",
     )
 
 
