@@ -37,6 +37,7 @@ def refused(arguments: list[str], capsys) -> tuple[int, str]:
         (["eval", "--assets", "maniskill", "--out", "x"], 2, "known: code"),
         (["eval", "--tasks", "fly", "--out", "x"], 2, "push-cube"),
         (["eval", "--methods", "magic", "--out", "x"], 2, "rip-gauss"),
+        (["eval", "--sets", "200", "--out", "x"], 2, "100 sets"),
         (["demo", "--demos", "0"], 2, "at least once"),
         (["eval", "--demos", "0", "--out", "x"], 2, "at least 1"),
         (["demo", "--seed", "-1"], 2, "whole number"),
