@@ -34,6 +34,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from stand_in import NAME, Server
 
+from robust_instant_policy.commands.options import natural, positive
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.evaluation import (
     Scene,
@@ -47,6 +48,7 @@ from robust_instant_policy.evaluation import (
 )
 from robust_instant_policy.evaluation.experiment import Progress
 from robust_instant_policy.evaluation.statistics import Summary
+from robust_instant_policy.evaluation.store import EPISODES_FILE
 from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
 from robust_instant_policy.evaluation.work import Outcome, SceneWork
 from robust_instant_policy.files import write_whole
@@ -258,6 +260,13 @@ def report(out: Path) -> None:
     print(TABLE.read_text())
 
 
+def percent(text: str) -> int:
+    """A whole number from 0 to 100."""
+    if (number := natural(text)) > 100:
+        raise argparse.ArgumentTypeError("must be at most 100")
+    return number
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -265,13 +274,15 @@ def main() -> None:
     running.add_argument("--out", type=Path, default=Path("runs/hallucinations"))
     running.add_argument("--data", type=Path, default=Path("data"))
     running.add_argument("--tasks", nargs="+", default=list(SIMULATION_TASKS))
-    running.add_argument("--rates", nargs="+", type=int, default=list(RATES))
-    running.add_argument("--scenes", type=int, default=20)
+    running.add_argument("--rates", nargs="+", type=percent, metavar="PERCENT", default=list(RATES))
+    running.add_argument("--scenes", type=positive, default=20)
     commands.add_parser("report").add_argument("out", type=Path)
     options = parser.parse_args()
     if options.command == "run":
         run(options.out, options.data, options.tasks, options.rates, options.scenes)
     else:
+        if not (options.out / EPISODES_FILE).exists():
+            parser.error(f"{options.out} holds no rows; write them with: hallucinations.py run --out {options.out}")
         report(options.out)
 
 

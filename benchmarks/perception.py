@@ -296,6 +296,8 @@ def main() -> None:
     if arguments.command == "accuracy":
         accuracy([name for name in arguments.tasks if not name.startswith("aloha")])
     elif arguments.command == "real":
+        if not (arguments.folder / "pair.json").exists():
+            parser.error(f"{arguments.folder} holds no pair.json; perception_real.py describes the folder")
         out = arguments.out or Path(tempfile.mkdtemp(prefix="keypoints-"))
         real(arguments.folder, out, arguments.features, arguments.keypoints, arguments.tilt)
     elif arguments.command == "picture":

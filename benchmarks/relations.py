@@ -3,7 +3,7 @@
     python benchmarks/relations.py                        # median, neighbours, gp: all families, minutes
     python benchmarks/relations.py --quick --llm embedded openai:gpt-4o    # compare language models in ten minutes
     python benchmarks/relations.py --noise 1 2 4 --demos 3 5 10 20
-    python benchmarks/relations.py --methods rip --families perp side --scenes 10
+    python benchmarks/relations.py --methods rip --llm embedded --families perp side --scenes 10
     python benchmarks/relations.py --confidence           # what Plan.confidence is worth, also in uncovered scenes
     python benchmarks/relations.py --table                # make no plans, only write the tables again
 
@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -36,6 +37,7 @@ from rich.progress import Progress
 from scipy.stats import mannwhitneyu
 from stand_in import StandIn
 
+from robust_instant_policy.commands.options import positive
 from robust_instant_policy.context import FactorisedPrompt
 from robust_instant_policy.errors import PlanningError, RipError
 from robust_instant_policy.evaluation.manifest import code_digest
@@ -58,6 +60,7 @@ from robust_instant_policy.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[1]
 ROWS = ROOT / "results" / "relations.jsonl"
+RUN = Path("runs/relations")  # of a quick comparison, which leaves results and documentation alone
 METHODS = ("median", "neighbours", "gp", "gp-world", "kat", "rip-gauss", "rip")
 ASKING = ("kat", "rip-gauss", "rip")
 CHEAP = ("median", "neighbours", "gp", "gp-world")
@@ -434,31 +437,45 @@ def in_mm(metres: float) -> str:
     return f"{1000 * metres:.1f}" if math.isfinite(metres) else "∞"
 
 
+def millimetres(text: str) -> float:
+    """A number, 0 or more."""
+    if not 0 <= (number := float(text)) < math.inf:
+        raise argparse.ArgumentTypeError("must be 0 or more")
+    return number
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--families", nargs="+", choices=FAMILIES, default=list(FAMILIES))
     parser.add_argument("--methods", nargs="+", choices=METHODS)
     parser.add_argument("--llm", nargs="*", default=[], help=f"as for rip.connect, or {STAND_IN}")
-    parser.add_argument("--noise", nargs="+", type=float, default=[2.0], help="of the keypoints, mm")
-    parser.add_argument("--demos", nargs="+", type=int, default=[10])
-    parser.add_argument("--sets", type=int, default=4, help="of demonstrations, for each family")
-    parser.add_argument("--scenes", type=int, default=5, help="new ones for each set")
+    parser.add_argument("--noise", nargs="+", type=millimetres, default=[2.0], help="of the keypoints, mm")
+    parser.add_argument("--demos", nargs="+", type=positive, default=[10])
+    parser.add_argument("--sets", type=positive, default=4, help="of demonstrations, for each family")
+    parser.add_argument("--scenes", type=positive, default=5, help="new ones for each set")
     parser.add_argument("--split", choices=("tune", "measure"), default="measure")
     parser.add_argument("--quick", action="store_true", help="a few families, one set, four scenes")
     parser.add_argument("--confidence", action="store_true", help="also scenes that no demonstration covers")
     parser.add_argument("--deadline", type=float, default=300.0, help="seconds a plan")
     parser.add_argument("--keep", action="store_true", help="do not repeat plans that another version of the code made")
-    parser.add_argument("--rows", type=Path, default=ROWS)
-    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="where the tables and the diagram go")
+    parser.add_argument("--rows", type=Path, help=f"default: {ROWS.relative_to(ROOT)}, or in {RUN} with --quick")
+    parser.add_argument("--out", type=Path, help=f"folder of the tables (default: docs, or {RUN} with --quick)")
     parser.add_argument("--table", action="store_true", help="make no plans")
     options = parser.parse_args()
     for name, value in (QUICK if options.quick else {}).items():
         setattr(options, name, value)
+    options.rows = options.rows or (RUN / ROWS.name if options.quick else ROWS)
+    options.out = options.out or (RUN if options.quick else ROOT / "docs")
     if options.confidence:
         options.methods, options.llm = options.methods or CONFIDENT, options.llm or [STAND_IN]
     options.methods = options.methods or (CHEAP + (ASKING if options.llm else ()))
+    if not options.llm and (asking := sorted(set(options.methods) & set(ASKING))):
+        parser.error(f"methods that ask a language model need --llm: {', '.join(asking)}")
     if not options.table:
-        run(options)
+        try:
+            run(options)
+        except RipError as error:
+            sys.exit(f"{parser.prog}: {error}")
     latest = {row.case: row for row in read_rows(options.rows) if row.case.split == options.split}
     rows = list(latest.values())
     usual = [row for row in rows if row.case.condition == USUAL]

@@ -194,7 +194,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         named = re.fullmatch(rf"{NAME}-(\d+)", str(body.get("model")))
-        if self.path not in ("/v1/chat/completions", "/v1/completions") or named is None:
+        if self.path not in ("/v1/chat/completions", "/v1/completions") or named is None or int(named[1]) > 100:
             self._send({"error": {"message": f"no such model or path; models are {NAME}-0 to {NAME}-100"}}, False)
             return
         chat = self.path == "/v1/chat/completions"

@@ -37,6 +37,7 @@ def refused(arguments: list[str], capsys) -> tuple[int, str]:
         (["eval", "--assets", "maniskill", "--out", "x"], 2, "known: code"),
         (["eval", "--tasks", "fly", "--out", "x"], 2, "push-cube"),
         (["eval", "--methods", "magic", "--out", "x"], 2, "rip-gauss"),
+        (["eval", "--sets", "200", "--out", "x"], 2, "100 sets"),
         (["demo", "--demos", "0"], 2, "at least once"),
         (["eval", "--demos", "0", "--out", "x"], 2, "at least 1"),
         (["demo", "--seed", "-1"], 2, "whole number"),
@@ -87,6 +88,12 @@ def test_demonstrations_of_another_task_are_refused(workbench, tmp_path, capsys)
     assert code == 1
     assert "push-cube" in line
     assert "peel-banana" in line
+
+
+def test_keypoints_are_not_compared_with_the_truth_of_another_level(workbench, tmp_path, capsys):
+    demos = str(workbench / "data" / "push-cube")
+    code, line = refused(["keypoints", "--demos", demos, "--level", "hard", "--out", str(tmp_path / "page")], capsys)
+    assert (code, "--level" in line) == (2, True)
 
 
 def test_a_depth_image_of_zeros_is_told(workbench, tmp_path, capsys):

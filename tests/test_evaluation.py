@@ -56,6 +56,7 @@ from robust_instant_policy.evaluation.work import SceneWork
 from robust_instant_policy.evaluation.workers import MAX_DEATHS, Agenda
 from robust_instant_policy.llm import SampleStore
 from robust_instant_policy.query import Answer, Query
+from robust_instant_policy.reporting.figures import draw, encode
 from robust_instant_policy.reporting.publication import publish
 from robust_instant_policy.reporting.tables import tables
 
@@ -357,6 +358,46 @@ def test_the_papers_numbers_stand_beside_rows_of_its_configuration_only(tmp_path
         assert heads[name][0] == "| method | push-cube | average |"
     assert "Configuration: adaptive" in "".join(heads["table1-adaptive.md"])
     assert set(pq.read_table(tmp_path / "episodes.parquet")["config"].to_pylist()) == {one.config for one in ours}
+
+
+def test_the_papers_numbers_stand_beside_its_own_settings_and_scenes_only(tmp_path):
+    exact = replace(RIP, **PAPER)
+    ours = (exact, replace(exact, queries=2), replace(exact, dof=3.0), replace(exact, demos=5))
+    for level in ("paper", "hard"):
+        rows = [replace(episode(one, 1, True), scene=Scene("push-cube", "seen", 1, level=level)) for one in ours]
+        suite = Suite("table1", ("push-cube",), ours, (1,), level=level)
+        (table, *_) = tables(Summary(suite, rows))
+        beside = [row[2] for row in table.rows] if "paper" in table.head else []
+        assert beside == (["100", "–", "–", "–"] if level == "paper" else [])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_figure_of_many_variants_has_room_for_its_legend_and_its_bars():
+    many = tuple(replace(RIP, queries=queries, model=f"a-model-with-a-long-name-{queries}") for queries in range(2, 32))
+    summary = Summary(Suite("chosen", ("push-cube",), many, (1,)), [episode(one, 1, True) for one in many])
+    assert encode(draw(summary, {}), "png").startswith(b"\x89PNG")
+
+
+def test_scenes_for_tuning_and_scenes_for_tests_have_tables_of_their_own(tmp_path):
+    seeds = scene_seed(0, 0, "tune"), scene_seed(0, 0, "test")
+    with pytest.raises(RipError, match="100 sets"):
+        first_demonstration_seed(100)
+    suite = Suite("chosen", ("push-cube",), (RIP,), seeds)
+    a_run(tmp_path, suite, [episode(RIP, seed, seed == seeds[0]) for seed in seeds], [])
+    publish(tmp_path)
+    assert "| rip | **100** (21 to 100)" in (tmp_path / "chosen-adaptive-tune.md").read_text()
+    test = (tmp_path / "chosen-adaptive-test.md").read_text()
+    assert "| rip | **0** (0 to 79)" in test
+    assert "marked" not in test  # there is no other method
+
+
+def test_frames_of_gp_and_the_estimator_mean_decide_what_a_row_is():
+    world = Variant("gp", frames="world")
+    assert world != Variant("gp")
+    assert [Variant("gp", **PAPER).config, Variant("gp", **PAPER | {"frames": "adaptive"}).config] == [
+        "paper", "paper, frames adaptive",
+    ]  # fmt: skip
+    assert Variant("rip", estimator="mean") == Variant("rip-gauss", estimator="mean") == Variant("mean")
 
 
 def test_the_papers_estimator_fitted_exactly_is_a_row_of_its_own_in_its_configuration():

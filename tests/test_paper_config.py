@@ -10,7 +10,7 @@ import pytest
 
 import robust_instant_policy as rip
 from robust_instant_policy.cli import main
-from robust_instant_policy.errors import UnknownNameError
+from robust_instant_policy.errors import ModelError, UnknownNameError
 from robust_instant_policy.policies import Settings, build_context, locate
 from robust_instant_policy.regression.em import fit_numbers
 
@@ -89,6 +89,12 @@ def test_an_evaluation_in_the_papers_configuration_is_named_so(url, workbench, m
         ("mean", "paper", "", "nearest"),
     ]
     assert "Configuration: paper; descriptors: efficientnet" in Path("runs/paper-config/chosen-paper.md").read_text()
+
+
+def test_the_stand_in_refuses_a_rate_above_100_percent(url, context, observation):
+    policy = rip.RobustInstantPolicy.paper(rip.connect(f"{url}#stand-in-150"), **PARTS).fit_context(context)
+    with pytest.raises(ModelError, match="stand-in-0 to stand-in-100"):
+        policy.plan(observation)
 
 
 def test_the_stand_in_repeats_itself_and_hallucinates_at_the_rate_it_is_told(context, observation):

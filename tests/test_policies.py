@@ -16,7 +16,15 @@ from robust_instant_policy.policies import (
     build_context,
     locate,
 )
-from robust_instant_policy.policies.confidence import UNKNOWN, Evidence, distortion, novelty, plan_confidence
+from robust_instant_policy.policies.confidence import (
+    UNKNOWN,
+    Evidence,
+    distortion,
+    novelty,
+    plan_confidence,
+    recognition,
+)
+from robust_instant_policy.policies.context import HARDLY_RECOGNISED
 from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.query import Answer
 from robust_instant_policy.tasks import make_task
@@ -61,6 +69,29 @@ def observation(workbench):
 @pytest.fixture(scope="module")
 def scene(context, observation):
     return locate(context, observation)
+
+
+def test_only_a_scene_that_lacks_what_was_demonstrated_is_called_hardly_recognised(context, scene, observation):
+    assert HARDLY_RECOGNISED not in scene.notes
+    left, top = np.rint(scene.located.pixels.min(axis=0)).astype(int) - 12
+    right, bottom = np.rint(scene.located.pixels.max(axis=0)).astype(int) + 13
+    rgb, depth = observation.rgb.copy(), observation.depth.copy()
+    rgb[top:bottom, left:right] = np.median(rgb.reshape(-1, 3), axis=0)
+    depth[top:bottom, left:right] = np.nanmedian(depth)
+    rgb[20:60, 20:26], depth[20:60, 20:26] = (200, 30, 30), np.nanmedian(depth) - 0.1  # another thing
+    located = context.extractor.locate(replace(observation, rgb=rgb, depth=depth))
+    missing = replace(
+        scene, located=located, recognition=recognition(context.extractor.confidence_, located.confidence)
+    )
+    assert HARDLY_RECOGNISED in missing.notes
+
+
+def test_objects_that_demonstrations_recognise_with_little_confidence_may_be_so_in_a_scene():
+    sure, unsure = np.full((4, 10), 0.8), np.full((4, 10), 0.4)
+    assert recognition(unsure, np.full(10, 0.35)) == 1
+    assert recognition(sure, np.full(10, 0.35)) < 1
+    assert recognition(unsure, np.full(10, 0.1)) < 0.5
+    assert recognition(sure[:1], np.full(10, 0.35)) == 1  # nothing to compare with
 
 
 def test_rip_and_rip_adaptive_succeed_with_the_embedded_model(demonstrations, observation):

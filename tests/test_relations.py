@@ -117,3 +117,10 @@ def test_the_benchmark_says_what_the_confidence_is_worth(tmp_path):
     for kind in ("usual scenes", *UNCOVERED):
         assert f"| neighbours | {kind} | 1, " in table
     assert (tmp_path / "images" / "relations_confidence.svg").stat().st_size > 1000
+
+
+def test_the_benchmark_refuses_methods_without_a_language_model_in_one_line(tmp_path):
+    command = [sys.executable, str(ROOT / "benchmarks" / "relations.py"), "--methods", "rip", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, "--llm" in done.stderr.splitlines()[-1]) == (2, True)
+    assert not list(tmp_path.iterdir())

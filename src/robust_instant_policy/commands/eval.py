@@ -32,7 +32,7 @@ from robust_instant_policy.evaluation import (
 )
 from robust_instant_policy.evaluation.cluster import RayWorkers
 from robust_instant_policy.evaluation.processes import LocalWorkers
-from robust_instant_policy.evaluation.scenes import SPLITS
+from robust_instant_policy.evaluation.scenes import SPLITS, first_demonstration_seed
 from robust_instant_policy.evaluation.store import EPISODES_FILE
 from robust_instant_policy.evaluation.work import Outcome, Workers
 from robust_instant_policy.llm import model_name
@@ -108,6 +108,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    first_demonstration_seed(options.sets - 1)  # refuses more sets than there are before anything is recorded
     settings = method_settings(options)
     base = Variant(
         "rip",

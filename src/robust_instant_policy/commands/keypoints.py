@@ -8,10 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from robust_instant_policy.commands.console import StageConsole
 from robust_instant_policy.commands.options import add_keypoints, add_level, beside, positive, seed
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import UsageError
 from robust_instant_policy.evaluation import scene_seed
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.perception import KeypointExtractor
@@ -21,6 +24,8 @@ from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 from robust_instant_policy.tasks.level import PAPER
 
+SAME_DEPTH_M = 0.005  # difference of depth between two renderings of one scene
+OTHER_PIXELS = 0.002  # share of pixels that differ by more, from which two images show different scenes
 NOISE_SEED = 1_000_000  # of the demonstrations' camera noise, apart from the scenes'
 Camera = Callable[[Observation, int], Observation]
 
@@ -29,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
     parser.add_argument("--scenes", type=positive, default=20, metavar="N", help="new scenes (default: %(default)s)")
     parser.add_argument("--seed", type=seed, default=0, help="seed of the first new scene (default: %(default)s)")
-    add_keypoints(parser)
+    add_keypoints(parser, "auto", "registration")
     parser.add_argument("--noise", action="store_true", help="add the noise of a stereo depth camera")
     add_level(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR-keypoints.html)")
@@ -60,6 +65,7 @@ def show_keypoints(
     demonstrations = load_demonstrations(demos)
     camera: Camera = CameraNoise().photograph if noisy else lambda seen, _: seen
     images = [camera(one.observation, NOISE_SEED + index) for index, one in enumerate(demonstrations)]
+    trajectories = [one.trajectory for one in demonstrations]  # they decide where a policy's keypoints lie, too
     name = demonstrations[0].task
     simulated = name in TASK_NAMES and all(one.seed is not None for one in demonstrations)
     extractor = make_extractor()
@@ -70,7 +76,7 @@ def show_keypoints(
         try:
             extractor = make_extractor(workspace=task.workspace)
             with screen.stage(f"keypoints of {len(images)} demonstrations"):
-                extractor.fit(images)
+                extractor.fit(images, trajectories)
             with screen.stage(f"{num_scenes} new scenes"):
                 scenes, accuracy = _compare(task, extractor, demonstrations, camera, num_scenes, seed)
         finally:
@@ -78,13 +84,21 @@ def show_keypoints(
         screen.say(f"    {accuracy.summary()}")
     else:
         with screen.stage(f"keypoints of {len(images)} demonstrations"):
-            extractor.fit(images)
+            extractor.fit(images, trajectories)
         screen.say("    no errors: the true positions are known for simulated tasks only")
     for note in extractor.notes_:
         screen.say(f"    {note}")
     write_whole(out, keypoints_page(extractor, images, scenes, accuracy, f"Keypoints of {name}").encode())
     screen.say(f"page: {out}")
     return out
+
+
+def _shows_the_same(scene: Observation, recorded: Observation) -> bool:
+    """Whether two depth images are of the same scene."""
+    if scene.depth.shape != recorded.depth.shape:
+        return False
+    differs = ~np.isclose(scene.depth, recorded.depth, rtol=0, atol=SAME_DEPTH_M, equal_nan=True)
+    return bool(differs.mean() < OTHER_PIXELS)
 
 
 def _compare(
@@ -97,7 +111,11 @@ def _compare(
 ) -> tuple[list[Observation], Accuracy]:
     known = []
     for demonstration in demonstrations:
-        task.reset(demonstration.seed)
+        if not _shows_the_same(task.reset(demonstration.seed), demonstration.observation):
+            raise UsageError(
+                f"the demonstration with seed {demonstration.seed} does not show the scene that {demonstration.task} "
+                "draws here: give --level as it was recorded"
+            )
         known.append(task.scene_truth())
     scenes, scenes_known = [], []
     for index in range(num_scenes):

@@ -67,7 +67,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         help="paper, paper-real: as in the paper, with a column of its Table II; the settings below change parts of it "
         "(default: %(default)s)",
     )
-    add_keypoints(parser)
+    add_keypoints(parser, "auto, or dino with --config paper", "registration, or nearest with --config paper")
     for name, words in (
         ("frames", "frames of the prompt"),
         ("layout", "layout of the prompt"),
@@ -84,14 +84,14 @@ def add_method(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_keypoints(parser: argparse.ArgumentParser) -> None:
-    """Add the settings of the keypoints."""
-    parser.add_argument("--features", help="image descriptors (default: auto, or dino with --config paper)")
+def add_keypoints(parser: argparse.ArgumentParser, features: str, correspondence: str) -> None:
+    """Add the settings of the keypoints; their defaults in words."""
+    parser.add_argument("--features", help=f"image descriptors (default: {features})")
     parser.add_argument(
         "--keypoints",
         choices=WORDS["keypoints"],
         help="keypoints by registration of objects, or by nearest descriptors as in the paper "
-        "(default: registration, or nearest with --config paper)",
+        f"(default: {correspondence})",
     )
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from robust_instant_policy.evaluation.variant import PAPER_CONFIGS, Variant
+from robust_instant_policy.tasks.level import PAPER
+
+if TYPE_CHECKING:  # suites name the tasks of Table I
+    from robust_instant_policy.evaluation.statistics import Summary
 
 # Table I: success rates with 10 demonstrations and GPT-4o.
 TABLE1_TASKS = (
@@ -22,17 +26,25 @@ TABLE1 = {
 DOWNSAMPLING = {"uniform": 52, "masked": 74}
 
 
-def is_told(variants: Sequence[Variant]) -> bool:
-    """Whether the paper's numbers may stand beside those of ``variants``: some are in the paper's configuration."""
-    return any(variant.config in PAPER_CONFIGS for variant in variants)
-
-
-def told(variant: Variant, task: str, beside: Sequence[Variant]) -> int | None:
-    """The paper's success rate in percent for a ``variant`` in its configuration, or of a method (such as dp) that
-    stands ``beside`` ones in it and is the same in all; else None.
+def is_told(summary: Summary) -> bool:
+    """Whether the paper's numbers may stand beside those of ``summary``: scenes of the paper's level, and some variants
+    in its configuration.
     """
-    own = [variant] if variant.config else beside
-    return table1(variant.method, task) if is_told(own) else None
+    return summary.suite.level == PAPER.name and any(one.config in PAPER_CONFIGS for one in summary.variants)
+
+
+def told(summary: Summary, variant: Variant, task: str) -> int | None:
+    """The paper's success rate in percent for a ``variant`` of ``summary`` with the settings of Table I, or of a method
+    (such as dp) that is the same in all configurations and stands beside ones in the paper's; else None.
+    """
+    same = not variant.config or (variant.config in PAPER_CONFIGS and _is_of_table1(variant))
+    return table1(variant.method, task) if same and is_told(summary) else None
+
+
+def _is_of_table1(variant: Variant) -> bool:
+    """Whether it has the paper's number of demonstrations and samples, ν and downsampling."""
+    usual = Variant(variant.method)
+    return all(getattr(variant, name) == getattr(usual, name) for name in ("demos", "queries", "dof", "downsampling"))
 
 
 def table1(method: str, task: str) -> int | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
-from robust_instant_policy.errors import NoDemonstrationsError
+from robust_instant_policy.errors import NoDemonstrationsError, UsageError
 from robust_instant_policy.tasks.record import record
 from robust_instant_policy.tasks.task import Task, bounded_seed
 
@@ -27,8 +27,15 @@ def scene_seed(seed: int, index: int, split: str = "tune") -> int:
     return bounded_seed(SPLITS[split] + seed * SEEDS_A_RUN + index)
 
 
+def split_of(seed: int) -> str:
+    """The one of `SPLITS` that the scene with ``seed`` belongs to."""
+    return "tune" if SPLITS["tune"] <= seed < SPLITS["test"] else "test"
+
+
 def first_demonstration_seed(demo_set: int) -> int:
-    """Seed of the first scene that is tried for a set of demonstrations."""
+    """Seed of the first scene that is tried for a set of demonstrations; raises `UsageError` beyond the last set."""
+    if demo_set >= (most := SPLITS["tune"] // SEEDS_A_SET):
+        raise UsageError(f"there are scenes for {most} sets of demonstrations; set {demo_set} would use those of tests")
     return demo_set * SEEDS_A_SET
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.evaluation.paper import TABLE1_TASKS
-from robust_instant_policy.evaluation.scenes import scene_seed
+from robust_instant_policy.evaluation.scenes import scene_seed, split_of
 from robust_instant_policy.evaluation.variant import Scene, Variant, configs, require_no_path
 from robust_instant_policy.policies import METHOD_NAMES
 from robust_instant_policy.policies.training import DEFAULT_STEPS
@@ -92,6 +92,15 @@ class Suite:
             config: replace(self, variants=tuple(one for one in self.variants if one.config in (config, "")))
             for config in configs(self.variants)
         }
+
+    def by_split(self) -> dict[str, Suite]:
+        """The scenes for tuning and those for tests each by themselves, if there are both, else all under ""."""
+        parts: dict[str, list[int]] = {}
+        for seed in self.seeds:
+            parts.setdefault(split_of(seed), []).append(seed)
+        if len(parts) < 2:
+            return {"": self}
+        return {split: replace(self, seeds=tuple(parts[split])) for split in sorted(parts)}
 
     def merged(self, other: Suite) -> Suite:
         """This and another suite of the same name, objects, assets and level as one."""

@@ -11,6 +11,7 @@ from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.policies import (
     ASKING_METHODS,
     CONFIGS,
+    FRAME_METHODS,
     IMAGE_METHODS,
     REGRESSING_METHODS,
     TRAINED_METHODS,
@@ -33,8 +34,8 @@ class Variant:
     sampling for one plan; ``code`` is the `code_digest` of the package, which stands for every setting that has no
     name here; ``demonstrations`` the digest of those that were shown, which are of the set ``demo_set`` (see
     `scenes.first_demonstration_seed`). What a method does not use is always empty (a number None), so that the same
-    work is never done, nor counted, under two names; RIP with ν = ∞ is "rip-gauss". Rows of versions that did not note
-    a setting have it empty, too: unknown.
+    work is never done, nor counted, under two names; RIP with ν = ∞ is "rip-gauss", with the estimator "mean" it is
+    "mean". Rows of versions that did not note a setting have it empty, too: unknown.
     """
 
     method: str
@@ -58,19 +59,25 @@ class Variant:
 
     def __post_init__(self) -> None:
         changed: dict[str, str | float | None] = {}
-        if self.method not in TRAINED_METHODS:
+        method = self.method
+        if method in ("rip", "rip-gauss") and self.estimator == "mean":
+            method = "mean"
+        elif method == "rip" and self.dof is not None and math.isinf(self.dof):
+            method = "rip-gauss"
+        changed["method"] = method
+        if method not in TRAINED_METHODS:
             changed["steps"] = None
-        if self.method == "rip" and self.dof is not None and math.isinf(self.dof):
-            changed["method"] = "rip-gauss"
-        if self.method == "rip-gauss":
+        if method == "rip-gauss":
             changed["dof"] = math.inf
-        elif self.method not in REGRESSING_METHODS:
+        elif method not in REGRESSING_METHODS:
             changed["dof"] = None
-        if self.method not in REGRESSING_METHODS:
+        if method not in REGRESSING_METHODS:
             changed["estimator"] = ""
-        if self.method not in ASKING_METHODS:
-            changed |= {"frames": "", "layout": "", "model": "", "deadline_s": None}
-        if self.method in IMAGE_METHODS:
+        if method not in ASKING_METHODS:
+            changed |= {"layout": "", "model": "", "deadline_s": None}
+        if method not in FRAME_METHODS:
+            changed["frames"] = ""
+        if method in IMAGE_METHODS:
             changed |= {"keypoints": "", "column": ""}
         for name, value in changed.items():
             object.__setattr__(self, name, value)

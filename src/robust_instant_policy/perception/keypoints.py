@@ -57,9 +57,9 @@ class KeypointExtractor:
     ``correspondence``: "registration" of objects, or "nearest" as published: best buddies and nearest neighbours (see
     `perception.nearest`), which uses no workspace. Deterministic for a ``seed``.
 
-    After `fit`: ``keypoints_ (I, K, 3)`` metres, world, and ``pixels_ (I, K, 2)`` (u, v) of I demonstrations;
-    ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``object_of_ (K,)``, the number of each
-    keypoint's; ``segmentations_``, see `segmentation`; ``notes_`` for the user, one line each.
+    After `fit`: ``keypoints_ (I, K, 3)`` metres, world, ``pixels_ (I, K, 2)`` (u, v) and ``confidence_ (I, K)`` in
+    [0, 1] of I demonstrations; ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``object_of_ (K,)``, the
+    number of each keypoint's; ``segmentations_``, see `segmentation`; ``notes_`` for the user, one line each.
     """
 
     def __init__(
@@ -129,6 +129,7 @@ class KeypointExtractor:
         found = [self._locate(view, [t.registrations[i] for t in self.objects_]) for i, view in enumerate(views)]
         self.keypoints_ = np.stack([located.keypoints for located in found])
         self.pixels_ = np.stack([located.pixels for located in found])
+        self.confidence_ = np.stack([located.confidence for located in found])
         self.object_of_ = np.repeat(np.arange(len(counts)), counts)
         models = [thing.model for thing in self.objects_]
         self.segmentations_ = tuple(
@@ -147,6 +148,7 @@ class KeypointExtractor:
             (image.points(cells), image.pixels(cells)) for image, cells in zip(images, self._shared.cells, strict=True)
         ]
         self.keypoints_, self.pixels_ = (np.stack(of_images) for of_images in zip(*found, strict=True))
+        self.confidence_ = self._shared.agreement()
         return self
 
     def locate(self, observation: Observation) -> Located:

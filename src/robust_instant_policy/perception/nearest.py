@@ -84,6 +84,15 @@ class SharedDescriptors:
             axis=0,
         )
 
+    def agreement(self) -> FloatArray:
+        """Mean cosine similarity ``(I, K)``, in [0, 1], of each descriptor and the keypoint's in the other images."""
+        count, keypoints = self.cells.shape
+        own = [
+            self.similarities(image)[np.arange(keypoints), cells]
+            for image, cells in zip(self.images, self.cells, strict=True)
+        ]
+        return np.clip((count * np.array(own, dtype=np.float64) - 1) / max(count - 1, 1), 0, 1)
+
     def find(self, image: Image) -> tuple[IntArray, FloatArray]:
         """The nearest neighbours ``(K,)`` among the patches of ``image`` with depth, and their similarity in [0, 1]."""
         similar = self.similarities(image)

@@ -8,6 +8,7 @@ import warnings
 from robust_instant_policy.policies.aggregation import aggregate
 from robust_instant_policy.policies.catalogue import (
     ASKING_METHODS,
+    FRAME_METHODS,
     IMAGE_METHODS,
     METHOD_NAMES,
     REGRESSING_METHODS,
@@ -36,6 +37,7 @@ from robust_instant_policy.policies.training import Training
 __all__ = [
     "ASKING_METHODS",
     "CONFIGS",
+    "FRAME_METHODS",
     "IMAGE_METHODS",
     "METHOD_NAMES",
     "REGRESSING_METHODS",

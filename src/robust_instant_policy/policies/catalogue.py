@@ -23,6 +23,7 @@ MAX_ADAPTIVE_QUERIES = 10  # limit of rip-adaptive, unless more are asked for
 
 METHOD_NAMES = ("rip", "rip-gauss", "mean", "rip-adaptive", "kat", "dp", "kat-dp", "neighbours", "gp")
 ASKING_METHODS = ("rip", "rip-gauss", "mean", "rip-adaptive", "kat")  # those that ask the language model
+FRAME_METHODS = (*ASKING_METHODS, "gp")  # those that work with either kind of frames
 REGRESSING_METHODS = ("rip", "rip-gauss", "rip-adaptive")  # those that have a ν
 TRAINED_METHODS = ("dp", "kat-dp")  # those that take minutes or hours to fit
 IMAGE_METHODS = ("dp",)  # those whose demonstrations need images of the whole episode

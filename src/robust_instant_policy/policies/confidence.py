@@ -31,7 +31,7 @@ UNKNOWN_NOTE = (
     f"scene); the confidence is at most {UNKNOWN}"
 )
 
-RECOGNISED = 0.5  # confidence of keypoints from which on a scene counts as recognised; 0.7 to 0.8 is usual
+RECOGNISED = 0.8  # of the least confidence among demonstrations, from which on a scene counts as recognised
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
 # Up to these values evidence says nothing: sound scenes have them.
 GOOD_DISTORTION = 2.0
@@ -181,9 +181,13 @@ def _variation(values: FloatArray) -> FloatArray:
     return 1.4826 * np.asarray(np.median(np.abs(values - np.median(values, axis=0)), axis=0))
 
 
-def recognition(keypoint_confidence: FloatArray) -> float:
-    """How far a scene was recognised, in [0, 1], from its keypoints' ``(K,)`` confidence.
+def recognition(demonstrated: FloatArray, keypoint_confidence: FloatArray) -> float:
+    """How far a scene was recognised, in [0, 1], from the confidence ``(K,)`` of its keypoints.
 
-    The lower quartile counts: one keypoint may be hidden, but an object that is missing has several.
+    It is compared with that of the demonstrations, ``demonstrated (I, K)``, of which the first is the reference that
+    the others are recognised by; with fewer than two there is nothing to compare, and it is 1. The lower quartile
+    counts: one keypoint may be hidden, but an object that is missing has several.
     """
-    return float(min(1.0, np.quantile(keypoint_confidence, 0.25) / RECOGNISED))
+    usual = np.quantile(demonstrated[1:], 0.25, axis=1)
+    least = RECOGNISED * float(usual.min()) if len(usual) else 0.0
+    return min(1.0, float(np.quantile(keypoint_confidence, 0.25)) / least) if least > 0 else 1.0

@@ -49,13 +49,15 @@ class Context:
 class LocatedScene:
     """What was recognised in one observation, what its checks found, and what both cost.
 
-    ``view`` is the observation as the checks see it; None where only keypoints are known.
+    ``view`` is the observation as the checks see it; None where only keypoints are known. ``recognition`` is how far
+    the scene was recognised, in [0, 1].
     """
 
     located: Located
     stage: Stage
     findings: tuple[Finding, ...] = ()
     view: View | None = None
+    recognition: float = 1.0
 
     @property
     def keypoints(self) -> FloatArray:
@@ -65,7 +67,7 @@ class LocatedScene:
     @property
     def notes(self) -> tuple[str, ...]:
         """For the user, one line each."""
-        hardly = (HARDLY_RECOGNISED,) if recognition(self.located.confidence) < 1 else ()
+        hardly = (HARDLY_RECOGNISED,) if self.recognition < 1 else ()
         return (*map(str, self.findings), *self.located.notes, *hardly)
 
 
@@ -141,4 +143,5 @@ def locate(context: Context, observation: Observation, progress: Progress = no_p
     with watch.stage("keypoints"):
         findings = context.report.require_observation(observation)
         located = context.extractor.locate(observation)
-    return LocatedScene(located, watch.stages[0], findings, View.of(observation))
+    recognised = recognition(context.extractor.confidence_, located.confidence)
+    return LocatedScene(located, watch.stages[0], findings, View.of(observation), recognised)

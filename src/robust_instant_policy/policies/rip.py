@@ -7,7 +7,6 @@ from typing import Any, Self
 
 from robust_instant_policy.llm import LanguageModel
 from robust_instant_policy.policies.aggregation import aggregate
-from robust_instant_policy.policies.confidence import recognition
 from robust_instant_policy.policies.context import LocatedScene
 from robust_instant_policy.policies.instant import KeypointActionTokens
 from robust_instant_policy.policies.policy import Plan
@@ -49,7 +48,7 @@ class RobustInstantPolicy(KeypointActionTokens):
             if enough or queries == most:
                 plan = aggregate(self.context_, scene, propose(self.context_, scene, samples, queries), settings)
                 # More samples do not show the scene better: what is enough depends on how well it was recognised.
-                threshold = ENOUGH_AGREEMENT * recognition(plan.keypoint_confidence)
+                threshold = ENOUGH_AGREEMENT * scene.recognition
                 if queries == most or plan.evidence["agreement"] >= threshold:
                     return plan, samples
             queries += 1

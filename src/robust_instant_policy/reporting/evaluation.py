@@ -47,7 +47,7 @@ CAUSES = {
 @dataclass(frozen=True)
 class Section:
     """One suite in one configuration: its name and level, the ``config``, the ``kinds`` of its objects where they are
-    not the level's usual ones, its figure as SVG and its tables.
+    not the level's usual ones, its figure as SVG and its tables; ``split`` of its scenes where a run has both.
     """
 
     name: str
@@ -56,18 +56,22 @@ class Section:
     kinds: tuple[str, ...]
     figure: bytes
     tables: Sequence[Table]
+    split: str = ""
 
     @property
     def title(self) -> str:
         config = f", configuration: {self.config}" if self.config else ""
         level = "" if self.level == PAPER.name else f", {self.level} scenes"
-        return TITLES[self.name] + config + level + (f" ({', '.join(self.kinds)} objects)" if self.kinds else "")
+        split = f", scenes of the split {self.split}" if self.split else ""
+        return (
+            TITLES[self.name] + config + level + split + (f" ({', '.join(self.kinds)} objects)" if self.kinds else "")
+        )
 
     @property
     def anchor(self) -> str:
         config = re.sub(r"[^\w.-]+", "-", self.config)
         level = "" if self.level == PAPER.name else self.level
-        return "-".join(word for word in (self.name, config, level, *self.kinds) if word)
+        return "-".join(word for word in (self.name, config, level, self.split, *self.kinds) if word)
 
     @property
     def image(self) -> str:

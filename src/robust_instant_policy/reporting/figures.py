@@ -26,6 +26,8 @@ AVERAGE = "average"
 GROUPS_A_ROW = 7  # of bars
 WIDTH_IN, HEIGHT_IN = 7.0, 2.8  # of a figure over both columns of a paper
 LINE_CHARACTERS = 75  # that fit below such a figure, side by side
+LEGEND_CHARACTERS, HANDLE_CHARACTERS = 100, 8  # that fit beside each other above it; a handle takes as much room
+LEGEND_ROW_IN, LEGEND_ROWS = 0.16, 2  # height of a row; so many fit into `HEIGHT_IN`
 PNG_DPI = 200
 MM = 1000.0
 PARAMETERS = {
@@ -86,15 +88,19 @@ def encode(figure: Figure, form: str) -> bytes:
 def _success_bars(summary: Summary) -> Figure:
     groups = [*summary.tasks, AVERAGE]
     num_rows = -(-len(groups) // GROUPS_A_ROW)
-    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN * num_rows), layout="constrained")
+    names = labels(summary.variants)
+    columns = max(1, min(4, LEGEND_CHARACTERS // (max(map(len, names)) + HANDLE_CHARACTERS)))
+    more_rows = max(0, -(-len(names) // columns) - LEGEND_ROWS)
+    height = HEIGHT_IN * num_rows + LEGEND_ROW_IN * more_rows
+    figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
     bounds = [len(groups) * row // num_rows for row in range(num_rows + 1)]
     styles = [_style(variant) for variant in summary.variants]
     for row in range(num_rows):
         axes = figure.add_subplot(num_rows, 1, row + 1)
         _bars(axes, summary, groups[bounds[row] : bounds[row + 1]], styles, partial(_paper_percent, summary))
         if row == 0:
-            told = paper.is_told(summary.variants)
-            _legend_above(axes, styles, labels(summary.variants), "paper, with GPT-4o" if told else "", 4)
+            told = any(_paper_percent(summary, one, task) for one in summary.variants for task in summary.tasks)
+            _legend_above(axes, styles, names, "paper, with GPT-4o" if told else "", columns)
     return figure
 
 
@@ -135,9 +141,9 @@ def _bars(axes: Axes, summary: Summary, groups: Sequence[str], styles: Sequence[
 def _paper_percent(summary: Summary, variant: Variant, group: str) -> float | None:
     """The paper's number for a task, or its average over the tasks that ``variant`` was tried in here."""
     if group != AVERAGE:
-        return paper.told(variant, group, summary.variants)
+        return paper.told(summary, variant, group)
     tried = [task for task in summary.tasks if summary.rate(variant, task) is not None]
-    known = [told for task in tried if (told := paper.told(variant, task, summary.variants)) is not None]
+    known = [told for task in tried if (told := paper.told(summary, variant, task)) is not None]
     return fmean(known) if len(known) == len(tried) else None
 
 
@@ -213,7 +219,7 @@ def _downsampling(summary: Summary) -> Figure:
     groups = [*summary.tasks, AVERAGE]
     styles = [looks[way] for way in ways]
 
-    is_told = paper.is_told(summary.variants)
+    is_told = paper.is_told(summary)
 
     def told(variant: Variant, group: str) -> float | None:
         return paper.DOWNSAMPLING[variant.downsampling] if is_told and group == AVERAGE else None

@@ -37,17 +37,20 @@ def publish(out: Path) -> str:
     if not episodes:
         raise DatasetError(f"{out} holds no executions yet; run rip eval --out {out} first")
     summaries = [
-        (config, Summary(part, episodes)) for suite in manifest.suites for config, part in suite.by_config().items()
+        (config, split, Summary(part, episodes))
+        for suite in manifest.suites
+        for split, scenes in suite.by_split().items()
+        for config, part in scenes.by_config().items()
     ]
-    of_paper = {row.key for _, summary in summaries if summary.suite.name != CHOSEN for row in summary.rows}
+    of_paper = {row.key for *_, summary in summaries if summary.suite.name != CHOSEN for row in summary.rows}
     shown = [
-        (config, summary)
-        for config, summary in summaries
+        (config, split, summary)
+        for config, split, summary in summaries
         if any(row.variant.config == config for row in summary.rows)
         and (summary.suite.name != CHOSEN or not {row.key for row in summary.rows} <= of_paper)
     ]
-    sections = [_publish_suite(out, config, summary) for config, summary in shown]
-    rows = list({row.key: row for _, summary in shown for row in summary.rows}.values())
+    sections = [_publish_suite(out, config, split, summary) for config, split, summary in shown]
+    rows = list({row.key: row for *_, summary in shown for row in summary.rows}.values())
     lost = failure_table(rows, failures)
     text = _text([table for section in sections for table in section.tables])
     write_whole(out / FAILURE_TABLE_FILE, lost.markdown().encode())
@@ -60,13 +63,13 @@ def publish(out: Path) -> str:
     return text
 
 
-def _publish_suite(out: Path, config: str, summary: Summary) -> Section:
+def _publish_suite(out: Path, config: str, split: str, summary: Summary) -> Section:
     suite = summary.suite
     usual = make_level(suite.level).objects
     kinds = tuple(kind for kind, expected in ((suite.objects, usual), (suite.assets, "code")) if kind != expected)
     figure = draw(summary, _kept_plans(out, summary))
     drawing = encode(figure, "svg")
-    section = Section(suite.name, suite.level, config, kinds, drawing, tables(summary))
+    section = Section(suite.name, suite.level, config, kinds, drawing, tables(summary), split)
     stem = section.anchor
     write_whole(out / f"{stem}.svg", drawing)
     write_whole(out / f"{stem}.png", encode(figure, "png"))

@@ -47,7 +47,7 @@ def success_table(summary: Summary) -> Table:
     configuration.
     """
     ours, variants = reference(summary.variants), summary.variants
-    told = [task for task in summary.tasks if task in paper.TABLE1_TASKS] if paper.is_told(variants) else []
+    told = [task for task in summary.tasks if any(paper.told(summary, one, task) is not None for one in variants)]
     stars = {one.variant: one.mark for one in summary.compare(ours)} if ours is not None else {}
     sets = {variant: summary.of_sets(variant) for variant in summary.variants}
     several = any(len(rates) > 1 for rates in sets.values())
@@ -61,29 +61,33 @@ def success_table(summary: Summary) -> Table:
         for task in summary.tasks:
             row.append(_cell(summary.rate(variant, task), summary.best(task)))
             if task in told:
-                percent = paper.told(variant, task, variants)
+                percent = paper.told(summary, variant, task)
                 row.append(NONE if percent is None else str(percent))
         tried = [task for task in told if summary.rate(variant, task) is not None]
         row.append(_spread(summary, variant, stars.get(variant, "")))
         if several:
             row.append(", ".join(f"{100 * rate:.1f}" for rate in sets[variant].values()))
         if told:
-            row.append(_paper_average(variant, tried, variants))
+            row.append(_paper_average(summary, variant, tried))
         rows.append(tuple(row))
     counts = ", ".join(
         f"{label} {_executions(summary, variant)}"
         for variant, label in zip(summary.variants, labels(summary.variants), strict=True)
     )
     over_same = ", the paper's over the same" if told else ""
+    marked = (
+        "RIP is significantly better than those marked \\* or \\*\\* (sign-flip test over scenes, Holm's correction "
+        "for the methods in this table, p < 0.05 and p < 0.005). "
+        if ours is not None and len(variants) > 1
+        else ""
+    )
     by_set = "The averages with each set of demonstrations stand beside them. " if several else ""
     return Table(
         (*head, "average", *(["with each set"] if several else []), *(["paper"] if told else [])),
         tuple(rows),
         f"{_configuration(variants)}Success in percent; in parentheses {INTERVAL}; the best of a task is bold. "
         "Averages are mean ± standard deviation over the tasks that the method was tried in"
-        f"{over_same}. {by_set}RIP is "
-        "significantly better than those marked \\* or \\*\\* (sign-flip test over scenes, Holm's correction for the "
-        f"methods in this table, p < 0.05 and p < 0.005). Executions a task: {counts}.",
+        f"{over_same}. {by_set}{marked}Executions a task: {counts}.",
     )
 
 
@@ -129,7 +133,8 @@ def test_table(summary: Summary) -> Table | None:
 
 def sweep_table(summary: Summary, name: str, value: Callable[[Variant], str]) -> Table:
     """One row a task, one column a value of what is varied."""
-    head = ("task", *(f"{name} = {told}" for told in values(summary.variants, value)))
+    told = zip(summary.variants, values(summary.variants, value), strict=True)
+    head = ("task", *(text if variant.method == "mean" else f"{name} = {text}" for variant, text in told))
     rows = [
         (task, *(_cell(summary.rate(variant, task), summary.best(task)) for variant in summary.variants))
         for task in summary.tasks
@@ -245,8 +250,8 @@ def _configuration(variants: Sequence[Variant]) -> str:
     return f"{'; '.join(words)}. " if words else ""
 
 
-def _paper_average(variant: Variant, tasks: Sequence[str], beside: Sequence[Variant]) -> str:
-    rates = [rate for task in tasks if (rate := paper.told(variant, task, beside)) is not None]
+def _paper_average(summary: Summary, variant: Variant, tasks: Sequence[str]) -> str:
+    rates = [rate for task in tasks if (rate := paper.told(summary, variant, task)) is not None]
     return "{:.0f} ± {:.0f}".format(*mean_and_deviation(rates)) if rates else NONE
 
 
@@ -269,7 +274,7 @@ def _with_tests(summary: Summary) -> list[Table]:
 
 def _downsampling(summary: Summary) -> list[Table]:
     table = sweep_table(summary, "downsampling", lambda variant: variant.downsampling)
-    if not paper.is_told(summary.variants):
+    if not paper.is_told(summary):
         return [table]
     told = [str(paper.DOWNSAMPLING[variant.downsampling]) for variant in summary.variants]
     row = ("paper, average of five tasks", *told)

@@ -108,7 +108,7 @@ class Distractor:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class Furnishing:
     """``table`` its colour, with wood ``grain`` or plain; light of relative ``brightness (3,)`` a colour channel, its
     directions rotated by ``azimuth`` rad about the vertical."""
 
@@ -170,14 +170,14 @@ class Layout:
             return usual
         return usual + self._rng("home").uniform(-self._level.start, self._level.start, usual.shape)
 
-    def surroundings(self) -> Surroundings | None:
+    def surroundings(self) -> Furnishing | None:
         """Table and light; None for the usual ones."""
         if not self._level.surroundings:
             return None
         rng = self._rng("surroundings")
         tint = rng.uniform(*BRIGHTNESS) * np.array([1.0, 1.0, 1.0]) * rng.uniform(0.92, 1.08, 3)
         table = TABLES[int(rng.integers(len(TABLES)))]
-        return Surroundings(table, bool(rng.random() < 0.5), tint, float(rng.uniform(-np.pi, np.pi)))
+        return Furnishing(table, bool(rng.random() < 0.5), tint, float(rng.uniform(-np.pi, np.pi)))
 
     def distractors(self) -> list[Distractor]:
         """Objects that belong to no task, beside what has been placed."""

@@ -40,7 +40,7 @@ from robust_instant_policy.tasks.aloha.surfaces import (
     revolved,
     tube,
 )
-from robust_instant_policy.tasks.level import PAPER, Distractor, Layout, Level, Region, Rod, Surroundings
+from robust_instant_policy.tasks.level import PAPER, Distractor, Furnishing, Layout, Level, Region, Rod
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.textures import laminate, wood
 
@@ -274,7 +274,7 @@ def _joint_ranges() -> FloatArray:
     return np.array([model.joint(f"{ARMS['left']}/{joint}").range for joint in ARM_JOINTS])
 
 
-def _furnish(spec: mujoco.MjSpec, surroundings: Surroundings | None) -> None:
+def _furnish(spec: mujoco.MjSpec, surroundings: Furnishing | None) -> None:
     """Physics, table, light and cameras; None for the usual surroundings."""
     option = spec.option
     option.timestep, option.integrator = TIMESTEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
