@@ -19,6 +19,7 @@ RAISED_M = 0.012  # height above the table from which a point belongs to an obje
 RAISED_DEVIATIONS = 5.0  # or this many deviations of the depth's noise, if that is more
 MIN_ON_PLANE = 0.4  # share of the readings on the table's plane from which its height and tilt mean something
 MUCH_BELOW = 0.3  # share of the readings below a plane that make it no table
+BEFORE_LENS = 0.3  # of the median depth: what is nearer hides the scene and is no part of it
 MIN_POINTS = 100  # readings below which an image says nothing
 PLANE_SEED = 0
 FAR_AWAY_M = 1e3
@@ -32,8 +33,8 @@ class View:
 
     ``depth (h, w)`` metres, NaN without a steady reading; ``points (h, w, 3)`` metres, world; ``rgb (h, w, 3)`` in
     0 to 255; ``plane (4,)`` unit normal (upward) and offset of the table; ``height (h, w)`` metres above it;
-    ``noise`` the deviation of the table's points from the plane, metres; ``raised (h, w)`` bool, above the table.
-    ``share_on_plane`` is the share of the readings that lie on the plane.
+    ``noise`` the deviation of the table's points from the plane, metres; ``raised (h, w)`` bool, above the table and
+    not right before the camera. ``share_on_plane`` is the share of the readings that lie on the plane.
     """
 
     observation: Observation
@@ -71,6 +72,8 @@ class View:
         noise = float(1.4826 * np.median(flat)) if len(flat) else 0.0
         raised = np.nan_to_num(height, nan=-1.0) > max(RAISED_M, RAISED_DEVIATIONS * noise)
         raised = median_filter(raised, size=3) if noise > 1e-3 else raised
+        with np.errstate(invalid="ignore"):
+            raised &= grid > BEFORE_LENS * np.median(grid[known])
         share = float((np.abs(height[known]) < max(RAISED_M, RAISED_DEVIATIONS * noise)).mean())
         return cls(observation, every, grid, rgb, points, plane, height, noise, share, raised)
 
