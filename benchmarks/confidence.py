@@ -196,8 +196,12 @@ def evidence_of(row: Row) -> Evidence:
 
 def confidence_of(row: Row, coefficients: Coefficients = COEFFICIENTS) -> float:
     """By ``coefficients``; 0 where it was refused, or a fault applied to the plan was noticed."""
-    noticed = row["fault"].endswith(":plan") and row["confidence"] == 0
-    return 0.0 if row["refused"] or noticed else plan_confidence(evidence_of(row), coefficients)
+    return 0.0 if row["refused"] or is_noticed(row) else plan_confidence(evidence_of(row), coefficients)
+
+
+def is_noticed(row: Row) -> bool:
+    """Whether a check of the plan found the fault that was put into it, of which its evidence does not know."""
+    return bool(row["fault"].endswith(":plan") and row["confidence"] == 0)
 
 
 def fit(options: argparse.Namespace) -> None:
@@ -206,6 +210,7 @@ def fit(options: argparse.Namespace) -> None:
     The prior decides where rows do not: most faults are refused, so few plans are wrong. Each task is then left out.
     """
     rows = [row for row in executed(all_rows(options.folder, "tune")) if not row["evidence"]["errors"]]
+    rows = [row for row in rows if not is_noticed(row)]
     rows = [row for row in rows if row["evidence"]["agreement"] >= GOOD_AGREEMENT]  # the other factor of the model
     names = [name for name in COEFFICIENTS if name != "constant"]
     found = [evidence_of(row).features() for row in rows]

@@ -21,8 +21,8 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
-    "constant": 2.92, "distortion": 0.79, "prediction": 0.62, "novelty": 1.47, "displacement": 0.96,
-    "precision": 1.19, "doubts": 3.68, "warnings": 0.77,
+    "constant": 3.99, "distortion": 1.14, "prediction": 1.88, "novelty": 1.7, "displacement": 1.37,
+    "precision": 0.99, "doubts": 1.0, "warnings": 1.44,
 }  # fmt: skip
 UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
 
