@@ -315,7 +315,7 @@ def beside(trajectory):
 
 def test_a_failure_is_laid_at_keypoints_that_were_off(scene):
     task, policy, observation, truth, place = scene
-    assert truth.error < 0.02
+    assert truth.error < 0.03  # the worst keypoint; they are moved by 12 cm below
     off = replace(truth.located, keypoints=truth.located.keypoints + np.array([0, 0.12, 0]))
     plan = policy.plan_scene(LocatedScene(off, Stage("keypoints", 0.0)))
     assert not task.execute(plan.trajectory).success
