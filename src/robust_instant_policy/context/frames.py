@@ -88,7 +88,7 @@ class Frame:
             return "world"
         origin = str(self.ends[0])
         if len(self.ends) == 2:
-            origin = f"{self.share:.0%} of the way from {origin} to {self.ends[1]}"
+            origin = f"{self.share:z.0%} of the way from {origin} to {self.ends[1]}"
         grows = "".join(f", further with the size of {thing}" for thing, _ in self.growth)
         return f"{origin}, {self.axes}{grows}"
 

@@ -64,7 +64,7 @@ class StepFrames:
             changes = [step for step in range(1, len(own)) if not own[step].continues(own[step - 1])]
             for start, stop in pairwise([0, *changes, len(own)]):
                 first, last = own[start], own[stop - 1]
-                words = str(last) if first.share == last.share else f"{first.share:.0%} to {last}"
+                words = str(last) if first.share == last.share else f"{first.share:z.0%} to {last}"
                 found.append((words, arm, start, stop - 1, poses[stop - 1, arm]))
         return found
 
