@@ -140,4 +140,5 @@ def test_a_scene_that_stretches_what_was_shown_is_outside():
     far[5:, 0] += 0.6
     assert prompt.outside(keypoints[0]) == 0
     assert prompt.outside(far) > 0.5
-    assert prompt.predicted_error < 0.05
+    assert prompt.scene_notes(keypoints[0]) == ()
+    assert any("extrapolation" in note for note in prompt.scene_notes(far))

@@ -29,7 +29,7 @@ def test_the_papers_level_leaves_everything_as_the_task_drew_it():
     np.testing.assert_array_equal(layout.place(pose, REACH), pose)
     np.testing.assert_array_equal(layout.home(home), home)
     assert not layout.distractors()
-    assert layout.surroundings() is None
+    assert layout.furnishing() is None
     assert layout.rod((0.0, 0.0, 1.3)) is None
 
 

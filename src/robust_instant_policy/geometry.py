@@ -17,6 +17,7 @@ from robust_instant_policy.errors import InvalidValueError
 
 FloatArray = NDArray[np.float64]
 
+MAD_TO_STD = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 MIN_TRIANGLE_HEIGHT_M = 1e-3  # below this the three gripper points say nothing about orientation
 
 
@@ -30,6 +31,11 @@ def as_numbers(name: str, values: ArrayLike, dtype: type = np.float64) -> NDArra
             return array.astype(dtype)
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise InvalidValueError(f"{name} must be an array of numbers, got {type(values).__name__} ({error})") from None
+
+
+def robust_std(values: FloatArray) -> FloatArray:
+    """Standard deviation over the first axis, from the median absolute deviation."""
+    return MAD_TO_STD * np.asarray(np.median(np.abs(values - np.median(values, axis=0)), axis=0))
 
 
 def make_pose(rotation: ArrayLike, position: ArrayLike) -> FloatArray:

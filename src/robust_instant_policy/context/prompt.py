@@ -28,6 +28,11 @@ CLOSE_NOTE = (
     "the scene lies between those in which the demonstrations do different things; the better supported way is "
     "followed (vote {:.2f}, 1 is as clear as the demonstrations)"
 )
+FAR_OUTSIDE = 0.5  # of the range that the demonstrations show, by which a scene lies beyond it
+OUTSIDE_NOTE = (
+    "distances or sizes on which the plan's frames depend lie outside of the demonstrations by {:.0%} of their range; "
+    "the plan is an extrapolation"
+)
 GUESS_NOTE = (
     "the frames are a guess: one or two demonstrations do not tell what a motion depends on; show three or more"
 )
@@ -74,11 +79,6 @@ class Prompt(ABC):
         """How clearly one way applies in the scene of ``keypoints (K, 3)``: 1 is as in the demonstrations, 0 a tie."""
         return 1.0
 
-    @property
-    def predicted_error(self) -> float:
-        """How far off, metres, demonstrations are at the worst step when each is predicted from the others."""
-        return max(frame.error for arm in self.frames.arms for frame in arm)
-
     def outside(self, keypoints: FloatArray) -> float:
         """How far the scene of ``keypoints (K, 3)`` lies outside of the demonstrations in what the frames depend on; 0
         within them, 1 by as much as they vary (`StepFrames.outside`)."""
@@ -92,8 +92,9 @@ class Prompt(ABC):
 
     def scene_notes(self, keypoints: FloatArray) -> tuple[str, ...]:
         """The same about the scene of ``keypoints (K, 3)``."""
-        vote = self.vote(keypoints)
-        return () if vote >= CLOSE_VOTE else (CLOSE_NOTE.format(vote),)
+        vote, outside = self.vote(keypoints), self.for_scene(keypoints).outside(keypoints)
+        close = () if vote >= CLOSE_VOTE else (CLOSE_NOTE.format(vote),)
+        return (*close, *((OUTSIDE_NOTE.format(outside),) if outside > FAR_OUTSIDE else ()))
 
     @abstractmethod
     def queries(self, keypoints: FloatArray) -> list[Query]:

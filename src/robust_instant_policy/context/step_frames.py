@@ -82,7 +82,7 @@ class StepFrames:
         scene = locate([thing for own in [*pairs, tuple(sizes)] for thing in own], every)
         values = [np.linalg.norm(scene[a].position - scene[b].position, axis=1) for a, b in pairs]
         values += [scene[thing].size for thing in sizes]
-        return max((_excess(own[:-1], own[-1]) for own in values), default=0.0)
+        return float(max((_excess(own[:-1], own[-1]) for own in values), default=0.0))
 
     def poses(self, keypoints: FloatArray) -> FloatArray:
         """Pose of each step's frame ``(T, A, 4, 4)`` in the scene of ``keypoints (K, 3)``."""

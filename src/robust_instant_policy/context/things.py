@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.distance import squareform
 from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.geometry import FloatArray, fit_rigid, fit_upright, rotations_about_vertical
+from robust_instant_policy.geometry import FloatArray, fit_rigid, fit_upright, robust_std, rotations_about_vertical
 
 RIGID_SPREADS = 3.5  # keypoints whose distance varies by so many times the smallest variation belong to the same thing,
 RIGID_SPREAD_M = (0.006, 0.015)  # within these limits
@@ -27,7 +27,6 @@ SIZE_EXPLAINS = 0.7  # relative spread of distances when divided by the size, be
 MAX_THINGS = 4  # of several keypoints: those of the most keypoints
 MIRRORED_DEMOS = 2  # in which a thing has the other hand: a single one may be an error
 MIRROR = np.array([1.0, -1.0, 1.0])
-MAD_TO_STD = 1.4826
 
 Kind = Literal["world", "point", "upright", "rigid", "scaled", "hinged"]
 
@@ -318,7 +317,7 @@ def spread(values: FloatArray) -> FloatArray:
     """Standard deviation over the first axis; from `DEMOS_FOR_MEDIANS` values on from the median absolute deviation."""
     if len(values) < DEMOS_FOR_MEDIANS:
         return values.std(axis=0)
-    return MAD_TO_STD * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
+    return robust_std(values)
 
 
 def _mean_shape(points: FloatArray, upright: bool, tolerance: float) -> tuple[FloatArray, bool]:

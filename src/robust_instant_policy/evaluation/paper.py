@@ -2,14 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from robust_instant_policy.evaluation.variant import PAPER_CONFIGS, Variant
-from robust_instant_policy.tasks.level import PAPER
-
-if TYPE_CHECKING:  # suites name the tasks of Table I
-    from robust_instant_policy.evaluation.statistics import Summary
-
 # Table I: success rates with 10 demonstrations and GPT-4o.
 TABLE1_TASKS = (
     "pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet",
@@ -24,27 +16,6 @@ TABLE1 = {
 }
 # Sec. V-B.2, over the five tasks with gripper actions: normal and gripper-based downsampling.
 DOWNSAMPLING = {"uniform": 52, "masked": 74}
-
-
-def is_told(summary: Summary) -> bool:
-    """Whether the paper's numbers may stand beside those of ``summary``: scenes of the paper's level, and some variants
-    in its configuration.
-    """
-    return summary.suite.level == PAPER.name and any(one.config in PAPER_CONFIGS for one in summary.variants)
-
-
-def told(summary: Summary, variant: Variant, task: str) -> int | None:
-    """The paper's success rate in percent for a ``variant`` of ``summary`` with the settings of Table I, or of a method
-    (such as dp) that is the same in all configurations and stands beside ones in the paper's; else None.
-    """
-    same = not variant.config or (variant.config in PAPER_CONFIGS and _is_of_table1(variant))
-    return table1(variant.method, task) if same and is_told(summary) else None
-
-
-def _is_of_table1(variant: Variant) -> bool:
-    """Whether it has the paper's number of demonstrations and samples, ν and downsampling."""
-    usual = Variant(variant.method)
-    return all(getattr(variant, name) == getattr(usual, name) for name in ("demos", "queries", "dof", "downsampling"))
 
 
 def table1(method: str, task: str) -> int | None:

@@ -8,16 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from robust_instant_policy.geometry import FloatArray, make_pose
+from robust_instant_policy.geometry import MAD_TO_STD, FloatArray, make_pose
 from robust_instant_policy.pointcloud import table_plane
 
-MAD_TO_DEVIATION = 1.4826  # standard deviation of a Gaussian with median absolute deviation 1
 MIN_HEIGHT_M = 0.010  # above the table, for points of objects,
 MIN_HEIGHT_DEVIATIONS = 4.0  # or this many standard deviations of the depth noise, if that is more
 BELOW_M = 0.05  # a ray that ends this far under the plane has passed the table
 MIN_BELOW_SHARE = 0.01  # of the image's points: fewer are errors of the depth
 EDGE_MARGIN_M = 0.02  # by which an object may reach over the edge
-MAX_ABOVE_M = 0.8  # of what stands on a table
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +35,7 @@ class Table:
         plane = table_plane(points, seed)
         heights = points @ plane[:3] + plane[3]
         near = np.abs(heights)[np.abs(heights) < MIN_HEIGHT_M]
-        noise = float(MAD_TO_DEVIATION * np.median(near)) if len(near) else 0.0
+        noise = float(MAD_TO_STD * np.median(near)) if len(near) else 0.0
         below = heights < -max(BELOW_M, MIN_HEIGHT_DEVIATIONS * noise)
         if below.mean() < MIN_BELOW_SHARE:
             below[:] = False

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, robust_std
 from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
@@ -161,12 +161,12 @@ def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
     pairs = np.triu_indices(len(keypoints), 1)
     shown, new = (np.linalg.norm((p[..., :, None, :] - p[..., None, :, :]), axis=-1) for p in (demonstrated, keypoints))
     shown, new = shown[:, *pairs], new[pairs]
-    variation = _variation(shown)
+    variation = robust_std(shown)
     rigid = variation < RIGID_M
     _, thing = connected_components(coo_array((rigid, pairs), shape=(len(keypoints),) * 2), directed=False)
 
     def quartiles(distances: FloatArray, others: FloatArray) -> FloatArray:
-        off = np.abs(distances - np.median(others, axis=0)) / np.maximum(_variation(others), DISTANCE_M)
+        off = np.abs(distances - np.median(others, axis=0)) / np.maximum(robust_std(others), DISTANCE_M)
         return np.array([np.quantile(off[rigid & (thing[pairs[0]] == one)], 0.75) for one in things])
 
     things = np.unique(thing[pairs[0]][rigid])
@@ -174,11 +174,6 @@ def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
         return float("nan")
     usual = np.median([quartiles(row, np.delete(shown, index, axis=0)) for index, row in enumerate(shown)], axis=0)
     return float((quartiles(new, shown) / np.maximum(usual, 1.0)).max())
-
-
-def _variation(values: FloatArray) -> FloatArray:
-    """Robust standard deviation over the first axis."""
-    return 1.4826 * np.asarray(np.median(np.abs(values - np.median(values, axis=0)), axis=0))
 
 
 def recognition(demonstrated: FloatArray, keypoint_confidence: FloatArray) -> float:

@@ -90,16 +90,14 @@ def build_context(
         settings.descriptors,
         settings.keypoints,
     ).fit([one.observation for one in demonstrations], [one.trajectory for one in demonstrations])
-    given = context_of_keypoints(extractor.keypoints_, [one.trajectory for one in demonstrations], settings)
-    aligned = align(given.trajectories)
-    views = [View.of(demonstrations[index].observation) for index in aligned.kept]
+    observations = [one.observation for one in demonstrations]
+    given = _context(extractor.keypoints_, [one.trajectory for one in demonstrations], settings, observations)
     return replace(
         given,
         demonstrations=tuple(demonstrations),
         extractor=extractor,
         pixels=extractor.pixels_,
         report=report,
-        surroundings=Surroundings.of(views, aligned.actions),
         notes=(*extractor.notes_, *report.notes, *given.notes),
     )
 
@@ -109,8 +107,20 @@ def context_of_keypoints(keypoints: FloatArray, trajectories: Sequence[Trajector
 
     There are no images to check; a plan is still held against the envelope of ``trajectories``.
     """
+    return _context(keypoints, trajectories, settings)
+
+
+def _context(
+    keypoints: FloatArray,
+    trajectories: Sequence[Trajectory],
+    settings: Settings,
+    observations: Sequence[Observation] = (),
+) -> Context:
+    """What keypoints, trajectories and, where there are any, ``observations`` of demonstrations give."""
     thinned = tuple(downsample(one, settings.downsampling, settings.num_steps) for one in trajectories)
     prompt = write_prompt(keypoints, thinned, settings.frames, settings.layout)
+    aligned = align(thinned)
+    views = [View.of(observations[index]) for index in aligned.kept] if observations else []
     return Context(
         (),
         None,
@@ -119,7 +129,7 @@ def context_of_keypoints(keypoints: FloatArray, trajectories: Sequence[Trajector
         thinned,
         prompt,
         SetReport((), Envelope.of(trajectories, HORIZONTAL), None),
-        Surroundings.of((), align(thinned).actions),
+        Surroundings.of(views, aligned.actions),
         leave_one_out(keypoints, thinned, prompt),
         prompt.notes(),
     )

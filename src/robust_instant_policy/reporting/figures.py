@@ -21,6 +21,7 @@ from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.evaluation.variant import Scene, Variant, by_demos, dof_symbol, labels, values
 from robust_instant_policy.policies import Plan
+from robust_instant_policy.reporting.comparison import is_comparable, paper_rate
 
 AVERAGE = "average"
 GROUPS_A_ROW = 7  # of bars
@@ -66,7 +67,8 @@ STYLES = {
 }
 PLAIN = Style("#808080", "-/", "*", (0, (1, 2)))
 
-Told = Callable[[Variant, str], float | None]  # the paper's number in percent for a variant in a task, or on average
+# The paper's number in percent for a variant in a task, or on average.
+PaperNumber = Callable[[Variant, str], float | None]
 
 
 def draw(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan]) -> Figure:
@@ -99,12 +101,14 @@ def _success_bars(summary: Summary) -> Figure:
         axes = figure.add_subplot(num_rows, 1, row + 1)
         _bars(axes, summary, groups[bounds[row] : bounds[row + 1]], styles, partial(_paper_percent, summary))
         if row == 0:
-            told = any(_paper_percent(summary, one, task) for one in summary.variants for task in summary.tasks)
-            _legend_above(axes, styles, names, "paper, with GPT-4o" if told else "", columns)
+            has_paper = any(_paper_percent(summary, one, task) for one in summary.variants for task in summary.tasks)
+            _legend_above(axes, styles, names, "paper, with GPT-4o" if has_paper else "", columns)
     return figure
 
 
-def _bars(axes: Axes, summary: Summary, groups: Sequence[str], styles: Sequence[Style], told: Told) -> None:
+def _bars(
+    axes: Axes, summary: Summary, groups: Sequence[str], styles: Sequence[Style], paper_number: PaperNumber
+) -> None:
     """One group of bars for each of ``groups``, tasks or their average; whiskers are Wilson's 95% interval, over tasks
     ± 1 sd; lines are the paper's numbers.
     """
@@ -131,8 +135,8 @@ def _bars(axes: Axes, summary: Summary, groups: Sequence[str], styles: Sequence[
             )
             whisker = 100 * np.array([[max(0.0, mean - low)], [max(0.0, high - mean)]])
             axes.errorbar(place + offset, 100 * mean, whisker, color="black", linewidth=0.7, capsize=1.5)
-            if (percent := told(variant, task)) is not None:
-                _told(axes, place + offset, width, percent)
+            if (percent := paper_number(variant, task)) is not None:
+                _paper_line(axes, place + offset, width, percent)
     room = max(8, LINE_CHARACTERS // len(groups))  # names break at their hyphens
     axes.set_xticks(range(len(groups)), [fill(group, room) for group in groups])
     _success_axis(axes)
@@ -141,26 +145,26 @@ def _bars(axes: Axes, summary: Summary, groups: Sequence[str], styles: Sequence[
 def _paper_percent(summary: Summary, variant: Variant, group: str) -> float | None:
     """The paper's number for a task, or its average over the tasks that ``variant`` was tried in here."""
     if group != AVERAGE:
-        return paper.told(summary, variant, group)
+        return paper_rate(summary, variant, group)
     tried = [task for task in summary.tasks if summary.rate(variant, task) is not None]
-    known = [told for task in tried if (told := paper.told(summary, variant, task)) is not None]
+    known = [paper_number for task in tried if (paper_number := paper_rate(summary, variant, task)) is not None]
     return fmean(known) if len(known) == len(tried) else None
 
 
-def _told(axes: Axes, centre: float, width: float, percent: float) -> None:
+def _paper_line(axes: Axes, centre: float, width: float, percent: float) -> None:
     """The paper's number: a line across the bar, edged in white so that it shows on dark ones."""
     ends = [centre - width / 2, centre + width / 2]
     axes.plot(ends, [percent, percent], color="white", linewidth=3.2, solid_capstyle="butt", zorder=4)
     axes.plot(ends, [percent, percent], color="black", linewidth=1.6, solid_capstyle="butt", zorder=5)
 
 
-def _legend_above(axes: Axes, styles: Sequence[Style], names: Sequence[str], told: str, columns: int) -> None:
+def _legend_above(axes: Axes, styles: Sequence[Style], names: Sequence[str], paper_label: str, columns: int) -> None:
     handles: list[Artist] = [
         Patch(facecolor=style.colour, edgecolor="black", linewidth=0.5, hatch=style.hatch, label=name)
         for style, name in zip(styles, names, strict=True)
     ]
-    if told:
-        handles.append(Line2D([], [], color="black", linewidth=1.6, label=told))
+    if paper_label:
+        handles.append(Line2D([], [], color="black", linewidth=1.6, label=paper_label))
     axes.legend(handles=handles, ncols=columns, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
 
@@ -171,7 +175,7 @@ def _demos(summary: Summary) -> Figure:
     groups = by_demos(summary.variants)
     for number, (label, of_count) in enumerate(groups.items()):
         shown = [of_count[count] for count in sorted(of_count)]
-        # a little apart, so that methods that do equally well can be told
+        # a little apart, so that methods that do equally well can be told apart
         places = [counts.index(one.demos) + 0.06 * (number - (len(groups) - 1) / 2) for one in shown]
         _curve(axes, summary, shown, places, _style(shown[0]), label)
     axes.set_xticks(range(len(counts)), [str(count) for count in counts])
@@ -219,13 +223,13 @@ def _downsampling(summary: Summary) -> Figure:
     groups = [*summary.tasks, AVERAGE]
     styles = [looks[way] for way in ways]
 
-    is_told = paper.is_told(summary)
+    comparable = is_comparable(summary)
 
-    def told(variant: Variant, group: str) -> float | None:
-        return paper.DOWNSAMPLING[variant.downsampling] if is_told and group == AVERAGE else None
+    def paper_number(variant: Variant, group: str) -> float | None:
+        return paper.DOWNSAMPLING[variant.downsampling] if comparable and group == AVERAGE else None
 
-    _bars(axes, summary, groups, styles, told)
-    _legend_above(axes, styles, [names[way] for way in ways], "paper, average of 5 tasks" if is_told else "", 2)
+    _bars(axes, summary, groups, styles, paper_number)
+    _legend_above(axes, styles, [names[way] for way in ways], "paper, average of 5 tasks" if comparable else "", 2)
     return figure
 
 

@@ -19,6 +19,7 @@ from robust_instant_policy.evaluation.statistics import (
 )
 from robust_instant_policy.evaluation.variant import Variant, by_demos, configs, dof_symbol, labels, values
 from robust_instant_policy.policies import METHOD_NAMES
+from robust_instant_policy.reporting.comparison import is_comparable, paper_rate
 
 NONE = "–"
 INTERVAL = "Wilson's 95% interval with one trial a scene"
@@ -47,34 +48,34 @@ def success_table(summary: Summary) -> Table:
     configuration.
     """
     ours, variants = reference(summary.variants), summary.variants
-    told = [task for task in summary.tasks if any(paper.told(summary, one, task) is not None for one in variants)]
+    compared = [task for task in summary.tasks if any(paper_rate(summary, one, task) is not None for one in variants)]
     stars = {one.variant: one.mark for one in summary.compare(ours)} if ours is not None else {}
     sets = {variant: summary.of_sets(variant) for variant in summary.variants}
     several = any(len(rates) > 1 for rates in sets.values())
     head = ["method"]
     for task in summary.tasks:
         of_paper = "paper, physical robot" if task.startswith("aloha") else "paper"
-        head += [task, of_paper] if task in told else [task]
+        head += [task, of_paper] if task in compared else [task]
     rows = []
     for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
         row = [label]
         for task in summary.tasks:
             row.append(_cell(summary.rate(variant, task), summary.best(task)))
-            if task in told:
-                percent = paper.told(summary, variant, task)
+            if task in compared:
+                percent = paper_rate(summary, variant, task)
                 row.append(NONE if percent is None else str(percent))
-        tried = [task for task in told if summary.rate(variant, task) is not None]
+        tried = [task for task in compared if summary.rate(variant, task) is not None]
         row.append(_spread(summary, variant, stars.get(variant, "")))
         if several:
             row.append(", ".join(f"{100 * rate:.1f}" for rate in sets[variant].values()))
-        if told:
+        if compared:
             row.append(_paper_average(summary, variant, tried))
         rows.append(tuple(row))
     counts = ", ".join(
         f"{label} {_executions(summary, variant)}"
         for variant, label in zip(summary.variants, labels(summary.variants), strict=True)
     )
-    over_same = ", the paper's over the same" if told else ""
+    over_same = ", the paper's over the same" if compared else ""
     marked = (
         "RIP is significantly better than those marked \\* or \\*\\* (sign-flip test over scenes, Holm's correction "
         "for the methods in this table, p < 0.05 and p < 0.005). "
@@ -83,7 +84,7 @@ def success_table(summary: Summary) -> Table:
     )
     by_set = "The averages with each set of demonstrations stand beside them. " if several else ""
     return Table(
-        (*head, "average", *(["with each set"] if several else []), *(["paper"] if told else [])),
+        (*head, "average", *(["with each set"] if several else []), *(["paper"] if compared else [])),
         tuple(rows),
         f"{_configuration(variants)}Success in percent; in parentheses {INTERVAL}; the best of a task is bold. "
         "Averages are mean ± standard deviation over the tasks that the method was tried in"
@@ -96,13 +97,13 @@ def test_table(summary: Summary) -> Table | None:
     ours = reference(summary.variants)
     if ours is None or len(summary.variants) == 1:
         return None
-    told = dict(zip(summary.variants, labels(summary.variants), strict=True))
+    names = dict(zip(summary.variants, labels(summary.variants), strict=True))
     rows = []
     for one in summary.compare(ours):
         low, high = one.interval
         rows.append(
             (
-                told[one.variant],
+                names[one.variant],
                 f"{100 * one.difference:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})" if one.paired.scenes else NONE,
                 str(one.paired.scenes),
                 str(one.paired.better),
@@ -133,8 +134,8 @@ def test_table(summary: Summary) -> Table | None:
 
 def sweep_table(summary: Summary, name: str, value: Callable[[Variant], str]) -> Table:
     """One row a task, one column a value of what is varied."""
-    told = zip(summary.variants, values(summary.variants, value), strict=True)
-    head = ("task", *(text if variant.method == "mean" else f"{name} = {text}" for variant, text in told))
+    columns = zip(summary.variants, values(summary.variants, value), strict=True)
+    head = ("task", *(text if variant.method == "mean" else f"{name} = {text}" for variant, text in columns))
     rows = [
         (task, *(_cell(summary.rate(variant, task), summary.best(task)) for variant in summary.variants))
         for task in summary.tasks
@@ -251,7 +252,7 @@ def _configuration(variants: Sequence[Variant]) -> str:
 
 
 def _paper_average(summary: Summary, variant: Variant, tasks: Sequence[str]) -> str:
-    rates = [rate for task in tasks if (rate := paper.told(summary, variant, task)) is not None]
+    rates = [rate for task in tasks if (rate := paper_rate(summary, variant, task)) is not None]
     return "{:.0f} ± {:.0f}".format(*mean_and_deviation(rates)) if rates else NONE
 
 
@@ -274,10 +275,10 @@ def _with_tests(summary: Summary) -> list[Table]:
 
 def _downsampling(summary: Summary) -> list[Table]:
     table = sweep_table(summary, "downsampling", lambda variant: variant.downsampling)
-    if not paper.is_told(summary):
+    if not is_comparable(summary):
         return [table]
-    told = [str(paper.DOWNSAMPLING[variant.downsampling]) for variant in summary.variants]
-    row = ("paper, average of five tasks", *told)
+    printed = [str(paper.DOWNSAMPLING[variant.downsampling]) for variant in summary.variants]
+    row = ("paper, average of five tasks", *printed)
     return [Table(table.head, (*table.rows, row), table.note)]
 
 

@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial import cKDTree
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.geometry import FloatArray, invert_pose, lift, transform_points
+from robust_instant_policy.geometry import MAD_TO_STD, FloatArray, invert_pose, lift, transform_points
 from robust_instant_policy.pointcloud import in_metres, steady, table_plane
 
 MAX_EDGE_PX = 160  # the longer edge of the grid
@@ -69,7 +69,7 @@ class View:
         plane = table_plane(points[known], PLANE_SEED)
         height = points @ plane[:3] + plane[3]
         flat = np.abs(height[known])[np.abs(height[known]) < 3 * RAISED_M]
-        noise = float(1.4826 * np.median(flat)) if len(flat) else 0.0
+        noise = float(MAD_TO_STD * np.median(flat)) if len(flat) else 0.0
         raised = np.nan_to_num(height, nan=-1.0) > max(RAISED_M, RAISED_DEVIATIONS * noise)
         raised = median_filter(raised, size=3) if noise > 1e-3 else raised
         with np.errstate(invalid="ignore"):

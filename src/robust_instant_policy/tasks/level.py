@@ -1,7 +1,7 @@
 """How hard a task's scenes are: what every task varies beside its own objects.
 
-`PAPER` draws the scenes of the paper. `HARD` adds what a real table has: a noisy camera, objects that lie the other way
-round, distractors, other tables and light, a rod that hides a part of the objects, and another start pose of the arm.
+`PAPER` draws the scenes of the paper. `HARD` adds what a real table has: a noisy camera, objects rotated by up to half
+a turn, distractors, other tables and light, a rod that hides a part of the objects, and another start pose of the arm.
 A cell draws everything from the `Layout` of one episode, so a task only says where its objects are and what they need.
 """
 
@@ -42,7 +42,7 @@ class Level:
     """What is varied. The defaults are those of the paper: nothing but what the task itself varies.
 
     ``camera`` is the noise of the images; ``turn`` the largest additional rotation of objects, rad; ``distractors`` the
-    fewest and the most; ``surroundings`` whether table and light vary; ``hides`` whether a rod hides a part of an
+    fewest and the most; ``furnishing`` whether table and light vary; ``hides`` whether a rod hides a part of an
     object; ``start`` the largest change of a joint of the start pose, rad; ``objects`` the set of the test scenes'
     objects where a task has two.
     """
@@ -51,14 +51,14 @@ class Level:
     camera: CameraNoise | None = None
     turn: float = 0.0
     distractors: tuple[int, int] = (0, 0)
-    surroundings: bool = False
+    furnishing: bool = False
     hides: bool = False
     start: float = 0.0
     objects: str = "seen"
 
 
 PAPER = Level("paper")
-HARD = Level("hard", CameraNoise(), np.pi, (2, 5), surroundings=True, hides=True, start=0.08, objects="unseen")
+HARD = Level("hard", CameraNoise(), np.pi, (2, 5), furnishing=True, hides=True, start=0.08, objects="unseen")
 LEVELS = {level.name: level for level in (PAPER, HARD)}
 
 
@@ -170,9 +170,9 @@ class Layout:
             return usual
         return usual + self._rng("home").uniform(-self._level.start, self._level.start, usual.shape)
 
-    def surroundings(self) -> Furnishing | None:
+    def furnishing(self) -> Furnishing | None:
         """Table and light; None for the usual ones."""
-        if not self._level.surroundings:
+        if not self._level.furnishing:
             return None
         rng = self._rng("surroundings")
         tint = rng.uniform(*BRIGHTNESS) * np.array([1.0, 1.0, 1.0]) * rng.uniform(0.92, 1.08, 3)

@@ -126,7 +126,7 @@ class AlohaEnv(gymnasium.Env):
         self._close_renderers()
         self.layout = Layout(self.level, self._seed, REGION)
         spec = two_arms()
-        _furnish(spec, self.layout.surroundings())
+        _furnish(spec, self.layout.furnishing())
         add_side_camera(spec.worldbody, *self.beside)
         self.build(spec)
         for index, distractor in enumerate(self.layout.distractors()):
@@ -274,8 +274,8 @@ def _joint_ranges() -> FloatArray:
     return np.array([model.joint(f"{ARMS['left']}/{joint}").range for joint in ARM_JOINTS])
 
 
-def _furnish(spec: mujoco.MjSpec, surroundings: Furnishing | None) -> None:
-    """Physics, table, light and cameras; None for the usual surroundings."""
+def _furnish(spec: mujoco.MjSpec, furnishing: Furnishing | None) -> None:
+    """Physics, table, light and cameras; None for the usual furnishing."""
     option = spec.option
     option.timestep, option.integrator = TIMESTEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone, option.noslip_iterations, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 3, 10.0
@@ -307,12 +307,12 @@ def _furnish(spec: mujoco.MjSpec, surroundings: Furnishing | None) -> None:
     )
     top = world.add_body(name="table-top", pos=[0, 0, -TABLE_SIZE_M[2] / 2])
     material, brightness = laminate(np.random.default_rng(0)), np.ones(3)
-    if surroundings is not None:
-        grain, brightness = surroundings.grain, surroundings.brightness
-        material = wood(surroundings.table, np.random.default_rng(0)) if grain else paint(surroundings.table)
+    if furnishing is not None:
+        grain, brightness = furnishing.grain, furnishing.brightness
+        material = wood(furnishing.table, np.random.default_rng(0)) if grain else paint(furnishing.table)
     add_surface(spec, top, "table-top", box_surface(TABLE_SIZE_M), material, shine=0.05)
     for direction, diffuse, shadow in LAMPS:
-        rotated = direction if surroundings is None else surroundings.direction(direction)
+        rotated = direction if furnishing is None else furnishing.direction(direction)
         world.add_light(
             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
             dir=rotated,

@@ -92,10 +92,10 @@ class CellEnv(BaseEnv):
         self.layout = Layout(self.level, int(self._episode_seed[0]), REGION)
         self.table_scene = TableSceneBuilder(env=self)
         self.table_scene.build()
-        surroundings = self.layout.surroundings()
-        if surroundings is not None:
+        furnishing = self.layout.furnishing()
+        if furnishing is not None:
             builder = self.scene.create_actor_builder()
-            paint = Paint(surroundings.table, grain=surroundings.grain)
+            paint = Paint(furnishing.table, grain=furnishing.grain)
             add_box(builder, (1.2, 1.6, MAT_M), (0.1, 0, MAT_M / 2), paint, collide=False)
             builder.initial_pose = sapien.Pose()
             builder.build_static(name="mat")
@@ -103,11 +103,11 @@ class CellEnv(BaseEnv):
     def _load_lighting(self, options: dict) -> None:
         # Slanted, so that flat metal does not reflect a lamp into the camera. No shadows: on the CPU they would take
         # several times as long to render as the rest of the image.
-        surroundings = self.layout.surroundings()
-        brightness = np.ones(3) if surroundings is None else surroundings.brightness
+        furnishing = self.layout.furnishing()
+        brightness = np.ones(3) if furnishing is None else furnishing.brightness
         self.scene.set_ambient_light(list(AMBIENT * brightness))
         for direction, color in LAMPS:
-            rotated = direction if surroundings is None else surroundings.direction(direction)
+            rotated = direction if furnishing is None else furnishing.direction(direction)
             self.scene.add_directional_light(rotated, list(np.array(color) * brightness))
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
