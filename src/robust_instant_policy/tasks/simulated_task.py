@@ -49,8 +49,8 @@ class Cell(Protocol):
     """A gymnasium environment that holds a scene with A arms; see the methods of the same names in `Task`.
 
     ``advance`` takes one control step towards ``command (A·(J + 1),)``: for each arm the joint angles and the finger
-    travel, rad and m. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is
-    not done, empty if it is done. ``layout`` has the draws of the scene.
+    travel, rad and m; ``joints`` measures the same. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure``
+    is the reason why the task is not done, empty if it is done. ``layout`` has the draws of the scene.
     """
 
     layout: Layout
@@ -59,6 +59,7 @@ class Cell(Protocol):
     def photograph(self) -> Observation: ...
     def scene_truth(self) -> SceneTruth: ...
     def advance(self, command: FloatArray) -> None: ...
+    def joints(self) -> FloatArray: ...
     def tool_poses(self) -> FloatArray: ...
     def video_frame(self) -> np.ndarray: ...
     def failure(self) -> str: ...
@@ -144,14 +145,53 @@ class SimulatedTask:
         failure = failure or self._cell.failure()
         return Execution(not failure, failure, steps / control_hz, worst)
 
-    def demonstrate(self, seed: int, with_images: bool = False, every: int = 1) -> Attempt:
-        observation = self.reset(seed)
-        rng = np.random.default_rng([seed, HAND_STREAM])
+    @property
+    def control_hz(self) -> float:
+        """Rate of `advance`."""
+        return self._timing.control_hz
+
+    @property
+    def arms(self) -> Sequence[Arm]:
+        """The working arms, with the start pose of the present scene as their home."""
+        return self._arms
+
+    def joints(self) -> FloatArray:
+        """Measured joint angles and finger travel of each arm ``(A·(J + 1),)``, rad and m."""
+        return self._cell.joints()
+
+    def tool_poses(self) -> FloatArray:
+        """Measured tool poses ``(A, 4, 4)``."""
+        return self._cell.tool_poses()
+
+    def look(self) -> Observation:
+        """What the camera sees now."""
+        return self._photograph()
+
+    def advance(self, command: FloatArray) -> None:
+        """One control step towards ``command (A·(J + 1),)``, joint angles and finger travel of each arm."""
+        self._fresh = False
+        self._cell.advance(command)
+
+    def failure(self) -> str:
+        """Why the task is not done now; empty if it is done."""
+        return self._cell.failure()
+
+    def expert_path(self) -> tuple[FloatArray, np.ndarray]:
+        """Tool poses ``(N, A, 4, 4)`` and gripper commands ``(N, A)`` of the demonstrator in the scene of `reset`."""
+        rng = np.random.default_rng([self._seed or 0, HAND_STREAM])
         strokes = self._spec.expert(self._cell, rng)
         home = np.stack([arm.home_pose for arm in self._arms])
         if self._level.turn:
             strokes = shorter_turns(strokes)
-        poses, closed = perform(home, strokes, rng, self._timing.control_hz)
+        return perform(home, strokes, rng, self._timing.control_hz)
+
+    def video_frame(self) -> Image:
+        """RGB frame ``(H, W, 3)`` uint8 of the camera for videos."""
+        return self._cell.video_frame()
+
+    def demonstrate(self, seed: int, with_images: bool = False, every: int = 1) -> Attempt:
+        observation = self.reset(seed)
+        poses, closed = self.expert_path()
         images: list[Image] = []
         try:
             motion = plan_poses(poses, closed, self._arms, self._timing.control_hz)

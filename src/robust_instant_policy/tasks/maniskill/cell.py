@@ -154,6 +154,11 @@ class CellEnv(BaseEnv):
             self.scene.step()
         self._elapsed_steps += 1
 
+    def joints(self) -> FloatArray:
+        """Measured joint angles, rad, and the travel of the first finger, m ``(7,)``."""
+        measured = self.agent.robot.get_qpos()[0, : len(HOME_JOINTS) + 1]
+        return measured.cpu().numpy().astype(np.float64)
+
     def _before_control_step(self) -> None:
         self._joints_before = self.agent.robot.get_qpos().clone()
 
