@@ -723,3 +723,10 @@ def test_results_are_not_written_among_demonstrations(workbench, tmp_path, capsy
     assert main([command, *words, "--out", str(demonstrations)]) == 1
     assert "holds demonstrations" in capsys.readouterr().err
     assert sorted(demonstrations.rglob("*")) == before
+
+
+def test_a_tuning_seed_that_reaches_the_test_scenes_is_refused():
+    make_suites(["chosen"], Choice(Variant("rip"), ["push-cube"], ["rip"], seed=899, split="tune"))
+    with pytest.raises(RipError, match="--split tune"):
+        make_suites(["chosen"], Choice(Variant("rip"), ["push-cube"], ["rip"], seed=900, split="tune"))
+    make_suites(["chosen"], Choice(Variant("rip"), ["push-cube"], ["rip"], seed=10**30, split="test"))

@@ -133,9 +133,14 @@ class Choice:
 
 
 def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:
-    """The analyses called ``names``, of which "all" stands for every one; raises `UnknownNameError` for others."""
+    """The analyses called ``names``, of which "all" stands for every one.
+
+    Raises `UnknownNameError` for others, and `UsageError` for scenes of a seed that do not lie in the chosen split.
+    """
     wanted = [one for name in names for one in (SUITE_NAMES if name == "all" else (name,))]
     seeds = tuple(scene_seed(choice.seed, index, choice.split) for index in range(choice.num_scenes))
+    if any(split_of(seed) != choice.split for seed in seeds):
+        raise UsageError(f"--seed {choice.seed} is too large for --split {choice.split}: its scenes are those of tests")
     objects = choice.objects or make_level(choice.level).objects
     suites = []
     for name in dict.fromkeys(wanted):
