@@ -56,7 +56,7 @@ def test_another_calibration_or_gripper_has_another_digest(cell):
     ("old", "new", "words"),
     [
         ("park = [", "prak = [", "park is missing"),
-        ("-0.32, -0.005]", "-0.32]", "workspace must be 2 x 3 finite numbers"),
+        ("-0.32, -0.005]", "-0.32]", "workspace must be 2 x 3 numbers"),
         ("[0.22, 0.32, 0.40]", "[-0.4, 0.32, 0.40]", "workspace must be the lower and then the upper corner"),
         ("joint_speed = 1.5", "joint_speed = -1", "joint_speed must be a number from 0.001 to 100"),
         ("joint_speed = 1.5", "joint_sped = 1.5", "joint_sped is not known here; is it misspelt"),
