@@ -119,7 +119,7 @@ def run(options: argparse.Namespace) -> int:
         layout=settings.layout,
         features=settings.features,
         model=model_name(options.llm),
-        keypoints=settings.keypoints,
+        keypoints=str(settings.keypoints),
         column=settings.column,
         estimator=settings.estimator,
     )

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 from robust_instant_policy.errors import InvalidValueError
+from robust_instant_policy.files import file_stem
 from robust_instant_policy.policies import (
     ASKING_METHODS,
     CONFIGS,
@@ -211,8 +212,8 @@ class Scene:
     level: str = "paper"
 
     def __post_init__(self) -> None:
-        require_no_path(self.task, self.objects, self.assets, self.level)
+        require_no_path(file_stem(self.task), self.objects, self.assets, self.level)
 
     def __str__(self) -> str:
         unusual = [value for value, usual in ((self.assets, "code"), (self.level, "paper")) if value != usual]
-        return "-".join((self.task, self.objects, str(self.seed), *unusual))
+        return "-".join((file_stem(self.task), self.objects, str(self.seed), *unusual))
