@@ -9,8 +9,8 @@ import numpy as np
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.checks import TABLE_TOLERANCE_M
 
-# In 96 demonstrations of twelve simulated tasks at both levels a tool turns by up to 35 degrees and moves by up to 0.24 m
-# between two of 30 waypoints.
+# In the demonstrations of twelve simulated tasks, at both levels, a tool turns by up to 32 degrees and moves by up to
+# 0.24 m between two of 30 waypoints.
 TURN_PER_STEP_RAD = np.deg2rad(60)
 STEP_M = 0.35
 ARM_DISTANCE_M = 0.02
