@@ -82,3 +82,11 @@ class RendererError(RipError):
 
 class UnreachableError(RipError):
     """A trajectory that the arm must not or cannot follow."""
+
+
+class CellError(RipError):
+    """The file of a cell is missing or wrong; names the file and the key."""
+
+
+class RobotError(RipError):
+    """An arm, a leader or a camera that is missing, faulty or does not answer."""

@@ -186,9 +186,7 @@ class _Checks:
             thinned.append(self.called("execute", Execution, downsample(trajectory)))
             resting = Trajectory.from_actions(np.repeat(trajectory.actions[:1], 2, axis=0))
             idle.append(self.called("execute", Execution, resting))
-        advice = (
-            "does execution wait at gripper changes (docs/executing.md), and is the gripper state the measured one?"
-        )
+        advice = "does execution wait at gripper changes, and is the gripper state the measured one?"
         for what, results, words in (
             ("demonstrations", whole, advice),
             (f"demonstrations thinned out to {len(downsample(shown[0][1].trajectory))} steps", thinned, advice),
