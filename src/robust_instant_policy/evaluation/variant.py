@@ -198,8 +198,11 @@ def by_demos(variants: Sequence[Variant]) -> dict[str, dict[int, Variant]]:
 
 
 def require_no_path(*names: str) -> None:
-    """Raises `InvalidValueError` for one with a slash or two dots: files are named after ``names``, also those that a run's folder
-    from elsewhere holds, and must stay inside of the folder that they are written to."""
+    """Raises `InvalidValueError` for one with a slash or two dots.
+
+    Files are named after ``names``, also those that a run's folder from elsewhere holds, and must stay inside of the
+    folder that they are written to.
+    """
     for name in names:
         if not isinstance(name, str) or "/" in name or ".." in name or "\0" in name:
             raise InvalidValueError(f"{name!r} leads to another folder; names of tasks, suites and objects do not")
