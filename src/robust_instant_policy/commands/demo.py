@@ -13,7 +13,7 @@ from robust_instant_policy.commands.options import DATA, RUNS, add_method, metho
 from robust_instant_policy.datasets import VideoWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import UnreachableError, UsageError
-from robust_instant_policy.evaluation import holds_results, obtain_demonstrations, scene_seed
+from robust_instant_policy.evaluation import Variant, holds_results, obtain_demonstrations, scene_seed
 from robust_instant_policy.llm import DEADLINE_S, connect
 from robust_instant_policy.policies import RobustInstantPolicy, Settings
 from robust_instant_policy.reporting.run import (
@@ -140,6 +140,7 @@ def _run(
         seed=scene,
         llm=model.name,
         method=policy.name,
+        config=Variant.of(policy.settings, policy.name).config,
         success=success,
         outcome=outcome,
         stages=tuple(stages),

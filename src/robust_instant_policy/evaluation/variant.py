@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.policies import (
@@ -16,6 +17,7 @@ from robust_instant_policy.policies import (
     REGRESSING_METHODS,
     TRAINED_METHODS,
 )
+from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.regression import DEFAULT_DOF
 
@@ -56,6 +58,12 @@ class Variant:
     column: str = "auto"
     estimator: str = "em"
     config: str = ""
+
+    @classmethod
+    def of(cls, settings: Settings, method: str = "rip", **others: Any) -> Variant:
+        """``method`` with those of the ``settings`` that decide a row; ``others`` are fields of a variant."""
+        names = ("downsampling", "frames", "layout", "features", "keypoints", "column", "estimator")
+        return cls(method, **{name: getattr(settings, name) for name in names}, **others)
 
     def __post_init__(self) -> None:
         changed: dict[str, str | float | None] = {}
