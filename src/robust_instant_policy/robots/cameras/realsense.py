@@ -145,7 +145,8 @@ class RealSenseCamera:
                 continue
             numbers = depth.get_frame_number(), color.get_frame_number()
             apart = abs(depth.get_timestamp() - color.get_timestamp())
-            if numbers[0] == self._last[0] or numbers[1] == self._last[1] or apart > MAX_MODULE_GAP * 1e3 / self._rate_hz:
+            repeated = any(number == last for number, last in zip(numbers, self._last, strict=True))
+            if repeated or apart > MAX_MODULE_GAP * 1e3 / self._rate_hz:
                 continue
             self._last = numbers
             return frames
