@@ -90,3 +90,7 @@ class CellError(RipError):
 
 class RobotError(RipError):
     """An arm, a leader or a camera that is missing, faulty or does not answer."""
+
+
+class CalibrationError(RipError):
+    """A calibration that the measurements do not determine or contradict; names the likely mistake."""
