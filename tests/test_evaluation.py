@@ -276,7 +276,7 @@ def test_code_that_decides_results_makes_other_rows_and_a_command_does_not(tmp_p
         return code_digest(copy)
 
     same = ("commands/eval.py", "reporting/tables.py", "evaluation/store.py")
-    deciding = ("policies/rip.py", "evaluation/rollout.py", "tasks/maniskill/ur5e_hande.urdf")
+    deciding = ("policies/rip.py", "evaluation/rollout.py", "motion/urdf/ur5e_hande.urdf")
     assert {digest_after(None), *map(digest_after, same)} == {code_digest()}
     assert len({code_digest(), *map(digest_after, deciding)}) == 1 + len(deciding)
 

@@ -8,6 +8,7 @@ from robust_instant_policy.robots.cell import CellConfig
 
 CELL = """
 [cell]
+turn_per_step = 45
 workspace = [[-0.30, -0.32, -0.005], [0.22, 0.32, 0.40]]
 
 [[arms]]
@@ -17,7 +18,7 @@ base = [-0.469, 0, 0, 0, 0, 90]
 park = [-1.4, -0.43, 0.434, 0.0, 1.567, 0.0]
 gripper = "gripper.toml"
 driver = { kind = "viperx", port = "/dev/ttyDXL" }
-limits = { joint_speed = 1.5, turn_per_step = 45 }
+joint_speed = 1.5
 
 [camera]
 kind = "realsense"
@@ -40,7 +41,8 @@ def test_a_cell_is_read_with_its_calibration_and_gripper(cell):
     (arm,) = config.arms
     assert (arm.gripper.length, arm.gripper.opening) == (0.15, 0.07)
     np.testing.assert_allclose(arm.base[:3, 0], [0, 1, 0], atol=1e-12)
-    assert arm.limits.turn_per_step == pytest.approx(np.pi / 4)
+    assert config.limits.turn_per_step == pytest.approx(np.pi / 4)
+    assert arm.joint_speed == 1.5
     assert arm.driver.section().text("port") == "/dev/ttyDXL"
     np.testing.assert_array_equal(config.camera_pose, np.diag([1.0, -1, -1, 1]))
     assert config.camera.section().text("serial") == "123"

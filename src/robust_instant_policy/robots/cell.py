@@ -1,7 +1,7 @@
 """The description of a cell: one TOML file that names arms, grippers, camera, workspace and limits.
 
-Lengths are in metres and joint angles in radians; the orientations of `base` are in degrees. ``docs/robots.md``
-explains each key. File names are relative to the file.
+Lengths are in metres and joint angles in radians; ``turn_per_step`` and the orientation in ``base`` are in degrees.
+``docs/robots.md`` explains each key. File names are relative to the file.
 """
 
 from __future__ import annotations
@@ -22,6 +22,14 @@ from scipy.spatial.transform import Rotation
 from robust_instant_policy.errors import CellError, DatasetError
 from robust_instant_policy.files import read_regular
 from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pose
+from robust_instant_policy.motion.checks import TABLE_TOLERANCE_M
+from robust_instant_policy.motion.limits import (
+    ARM_DISTANCE_M,
+    FOLLOWING_ERROR_RAD,
+    STEP_M,
+    TURN_PER_STEP_RAD,
+    Limits,
+)
 
 MIN_CONFIDENCE = 0.9  # of a plan; below it `rip run` refuses (docs/trust.md)
 FIRST_RUN_SPEED = 0.25  # share of the usual speed, until a first run in a cell has ended well
@@ -124,28 +132,14 @@ class DeviceConfig:
         return cls(section.text("kind"), section.rest(), where)
 
 
-@dataclass(frozen=True)
-class LimitsConfig:
-    """Limits of one arm that the file may narrow; None leaves that of the arm's model.
-
-    ``joint_speed`` rad/s, ``joint_acceleration`` rad/s², ``tool_speed`` m/s, ``following_error`` rad,
-    ``turn_per_step`` rad between two waypoints (degrees in the file), ``step`` metres between two waypoints.
-    """
-
-    joint_speed: float | None
-    joint_acceleration: float | None
-    tool_speed: float | None
-    following_error: float | None
-    turn_per_step: float | None
-    step: float | None
-
-
 @dataclass(frozen=True, eq=False)
 class ArmConfig:
     """An arm of the cell.
 
     ``model`` is a known one or the path of a URDF; ``base (4, 4)`` its pose in the world; ``park (J,)`` the joint
-    angles, rad, out of the camera's sight, where a run begins; ``gripper`` None for that of the model.
+    angles, rad, out of the camera's sight, where a run begins; ``gripper`` None for that of the model;
+    ``joint_speed`` rad/s, ``joint_acceleration`` rad/s² and ``tool_speed`` m/s narrow the model's limits, None leaves
+    them.
     """
 
     name: str
@@ -155,25 +149,26 @@ class ArmConfig:
     gripper: GripperTriangle | None
     driver: DeviceConfig
     leader: DeviceConfig | None
-    limits: LimitsConfig
+    joint_speed: float | None
+    joint_acceleration: float | None
+    tool_speed: float | None
 
 
 @dataclass(frozen=True, eq=False)
 class CellConfig:
     """A cell, as its file describes it.
 
-    ``rate_hz`` is that of commands, ``execute_hz`` that of a plan's waypoints; ``workspace (2, 3)`` holds the lower
-    and upper corner of the volume where grippers may be; ``table`` is the height of the table's plane, metres;
-    ``camera_pose (4, 4)`` is camera to world, OpenCV axes, None before the camera was calibrated; ``task`` names what
-    is shown in the emulated cell (``emulation``), None with real devices.
+    ``rate_hz`` is that of commands, ``execute_hz`` that of a plan's waypoints; ``limits`` holds the workspace and what
+    else a motion must respect; a plan below ``min_confidence`` is refused; ``camera_pose (4, 4)`` is camera to world,
+    OpenCV axes, None before the camera was calibrated; ``emulation`` is the table of an emulated cell, None with real
+    devices. The world's origin lies on the table, z up.
     """
 
     path: Path
     name: str
     rate_hz: float
     execute_hz: float
-    workspace: FloatArray
-    table: float
+    limits: Limits
     min_confidence: float
     first_run_speed: float
     arms: tuple[ArmConfig, ...]
@@ -209,18 +204,12 @@ class CellConfig:
                 camera_pose = read_camera_pose(calibration) if calibration.exists() else None
             camera = DeviceConfig.read(section, f"{path}: camera")
         emulation = root.section("emulation").rest() if "emulation" in root else None
-        workspace = cell.array("workspace", (2, 3))
-        if not (workspace[0] < workspace[1]).all():
-            raise cell.error(
-                "workspace", "must be the lower and then the upper corner, [[x, y, z], [x, y, z]] in metres"
-            )
         config = cls(
             path=path,
             name=cell.text("name", path.stem),
             rate_hz=cell.number("rate_hz", 50.0, 5.0, 1000.0),
             execute_hz=cell.number("execute_hz", 1.0, 0.1, 50.0),
-            workspace=workspace,
-            table=cell.number("table", 0.0, -2.0, 2.0),
+            limits=_limits(cell),
             min_confidence=cell.number("min_confidence", MIN_CONFIDENCE, 0.0, 1.0),
             first_run_speed=cell.number("first_run_speed", FIRST_RUN_SPEED, 0.05, 1.0),
             arms=arms,
@@ -260,6 +249,20 @@ def _gripper(section: Section) -> GripperTriangle:
     )
 
 
+def _limits(cell: Section) -> Limits:
+    workspace = cell.array("workspace", (2, 3))
+    if not (workspace[0] < workspace[1]).all():
+        raise cell.error("workspace", "must be the lower and then the upper corner, [[x, y, z], [x, y, z]] in metres")
+    return Limits(
+        workspace,
+        table_depth=cell.number("table_depth", TABLE_TOLERANCE_M, 0.0, 0.05),
+        arm_distance=cell.number("arm_distance", ARM_DISTANCE_M, 0.0, 1.0),
+        turn_per_step=math.radians(cell.number("turn_per_step", math.degrees(TURN_PER_STEP_RAD), 1.0, 180.0)),
+        step=cell.number("step", STEP_M, 0.01, 2.0),
+        following_error=cell.number("following_error", FOLLOWING_ERROR_RAD, 0.01, 2.0),
+    )
+
+
 def _arm(section: Section, path: Path) -> ArmConfig:
     name = section.text("name")
     base = section.array("base", (6,), [0.0] * 6)
@@ -267,8 +270,6 @@ def _arm(section: Section, path: Path) -> ArmConfig:
     if "gripper" in section:
         file = section.text("gripper")
         gripper = read_gripper(path.parent / file)
-    limits = section.section("limits", {})
-    turn = "turn_per_step"
     config = ArmConfig(
         name=name,
         model=section.text("model"),
@@ -279,12 +280,8 @@ def _arm(section: Section, path: Path) -> ArmConfig:
         leader=DeviceConfig.read(section.section("leader"), f"{path}: leader of {name}")
         if "leader" in section
         else None,
-        limits=LimitsConfig(
-            **{key: _optional(limits, key) for key in LimitsConfig.__dataclass_fields__ if key != turn},
-            turn_per_step=math.radians(limits.number(turn, least=1.0, most=180.0)) if turn in limits else None,
-        ),
+        **{key: _optional(section, key) for key in ("joint_speed", "joint_acceleration", "tool_speed")},
     )
-    limits.finish()
     section.finish()
     return config
 
