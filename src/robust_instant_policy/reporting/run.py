@@ -56,7 +56,11 @@ RUN_FILE, PLAN_FILE, SEEN_FILE, CONTEXT_FILE, VIDEO_FILE, REPORT_FILE = (
 
 @dataclass(frozen=True)
 class RunRecord:
-    """The facts of a run that are not in the plan. ``success`` is None if the plan was not executed."""
+    """The facts of a run that are not in the plan.
+
+    ``success`` is None if the plan was not executed; ``config`` is `Variant.config`, empty for runs of versions that
+    did not note it.
+    """
 
     task: str
     description: str
@@ -66,6 +70,7 @@ class RunRecord:
     success: bool | None
     outcome: str
     stages: tuple[Stage, ...]
+    config: str = ""
 
     def save(self, folder: Path) -> None:
         write_whole(folder / RUN_FILE, (json.dumps(asdict(self), indent=1) + "\n").encode())
