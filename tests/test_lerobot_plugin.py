@@ -16,7 +16,7 @@ from robust_instant_policy.policies import Neighbours
 from robust_instant_policy.tasks import make_task
 
 PLUGIN = Path(__file__).parents[1] / "plugins/lerobot_policy_rip/lerobot_policy_rip"
-URDF = Path(__file__).parents[1] / "src/robust_instant_policy/tasks/maniskill/ur5e_hande.urdf"
+URDF = Path(__file__).parents[1] / "src/robust_instant_policy/motion/urdf/ur5e_hande.urdf"
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
 DOWN = np.diag([1.0, -1.0, -1.0])
 TRIANGLE = GripperTriangle(length=0.1, opening=0.08)
@@ -121,7 +121,7 @@ def test_a_plan_begins_at_the_measured_state_and_does_the_task(planner):
         seen = task.reset(1_000_000)
         robot = Embodiment.simulated(task.end_effectors, [arm.triangle for arm in task.arms])
         state = robot.to_robot(task.joints())
-        actions = planner(0.0).plan(seen.rgb, seen.depth, state)
+        actions = planner(0.01).plan(seen.rgb, seen.depth, state)
         assert np.abs(actions[0] - state)[:6].max() < 1.0
         for action in actions.astype(np.float32):
             task.advance(robot.from_robot(action))
@@ -133,7 +133,7 @@ def test_a_plan_begins_at_the_measured_state_and_does_the_task(planner):
 def test_a_plan_below_the_confidence_threshold_is_refused_with_its_reason(planner, workbench):
     seen = Observation.load(workbench / "observation.npz")
     state = [51.6, -108.9, 126.1, -107.1, -90.0, -38.4, 100.0]
-    with pytest.raises(PlanningError, match=r"refused: its confidence is .*, 1\.01 is asked"):
+    with pytest.raises(PlanningError, match=r"is refused: confidence .*, needed 1\.01"):
         planner(1.01).plan(seen.rgb, seen.depth, state)
 
 

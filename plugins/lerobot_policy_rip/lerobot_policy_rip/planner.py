@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import PlanningError, UsageError
+from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.waypoints import plan_waypoints
 from robust_instant_policy.policies import Policy
+from robust_instant_policy.serving.planner import require_confidence
 
 from .embodiment import Embodiment
 
@@ -71,9 +72,6 @@ class Planner:
         """
         arms = self.embodiment.arms_at(state)
         plan = self._policy.plan(Observation(rgb, depth, self._camera.intrinsics, self._camera.pose))
-        if plan.confidence is None or plan.confidence < self._min_confidence:
-            known = "none" if plan.confidence is None else f"{plan.confidence:.2f}"
-            reasons = "".join(f"; {note}" for note in plan.notes)
-            raise PlanningError(f"refused: its confidence is {known}, {self._min_confidence:g} is asked{reasons}")
+        require_confidence(plan, self._min_confidence)
         motion = plan_waypoints(plan.trajectory, arms, self._waypoint_hz, self._rate_hz)
         return self.embodiment.to_robot(motion.commands)
