@@ -82,3 +82,7 @@ class CellError(RipError):
 
 class RobotError(RipError):
     """An arm, a leader or a camera that is missing, faulty or does not answer."""
+
+
+class StoppedError(RobotError):
+    """A motion was stopped: the arms hold their position; says what was wrong and what to do."""
