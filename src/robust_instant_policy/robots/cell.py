@@ -178,6 +178,11 @@ class CellConfig:
     emulation: Mapping[str, Any] | None = field(default=None)
 
     @property
+    def pace(self) -> float:
+        """How much faster than time the cell runs; 1 for real devices."""
+        return 1.0 if self.emulation is None else float(self.emulation.get("pace", 1.0))
+
+    @property
     def digest(self) -> str:
         """Digest of the camera's calibration, the grippers and the arms' bases: a plan holds in the cell it was made
         for."""

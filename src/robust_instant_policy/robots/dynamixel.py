@@ -6,9 +6,11 @@ Registers are those of the X series' control table (Robotis e-Manual, XM540-W270
 from __future__ import annotations
 
 import math
+import termios
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -21,8 +23,8 @@ try:
 except ModuleNotFoundError as error:
     raise MissingExtraError(error.name or "dynamixel-sdk", "robots") from error
 
-TRIES = 2  # of a transaction: both together stay under 100 ms
-TIMEOUT_MS = 40.0  # of one; a USB adapter with a latency timer of 16 ms needs up to 34
+TIMEOUT_MS = 40.0  # of a transaction; a USB adapter with a latency timer of 16 ms needs up to 34
+RETRY_MS = 45.0  # since the first try: the last one still ends within 100 ms
 TURN = 4096  # position units in one turn
 ZERO = 2048  # position of angle 0
 VELOCITY_UNIT = 0.229 * 2 * math.pi / 60  # rad/s
@@ -63,6 +65,7 @@ POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE = 3, 4, 5
 TICK_TURN = 32768
 MODEL_NAMES = {1020: "XM430-W350", 1030: "XM430-W210", 1060: "XL430-W250", 1120: "XM540-W270", 1130: "XM540-W150",
                1190: "XL330-M077", 1200: "XL330-M288"}  # fmt: skip
+UNPLUGGED = (OSError, serial.SerialException, termios.error, TypeError)  # what pyserial raises then
 HARDWARE_ERRORS = {
     0x01: "input voltage out of range; check the power supply",
     0x04: "overheated; let it cool down",
@@ -106,14 +109,12 @@ class Bus:
     def write(self, servo: int, register: Register, value: int) -> None:
         """Write and wait for the servo's answer; raises `RobotError` where it refuses the value."""
         data = list((value & ((1 << 8 * register.size) - 1)).to_bytes(register.size, "little"))
-        for attempt in range(TRIES):
-            result, error = self._call(
-                lambda: self._packets.writeTxRx(self._port, servo, register.address, register.size, data)
-            )
-            if result == sdk.COMM_SUCCESS:
-                break
-            if attempt == TRIES - 1:
-                raise RobotError(self._silent(servo))
+
+        def transaction() -> tuple[int, int, int]:
+            result, error = self._packets.writeTxRx(self._port, servo, register.address, register.size, data)
+            return error, result, servo
+
+        error = self._repeated(transaction)
         if error & ~ALERT:
             words = self._packets.getRxPacketError(error)
             raise RobotError(
@@ -124,12 +125,7 @@ class Bus:
         """Values ``(S, R)`` int64 of one block of ``registers``, in the order of their addresses, of all ``servos``."""
         start, last = registers[0], registers[-1]
         length = last.address + last.size - start.address
-        for attempt in range(TRIES):
-            rows, missing = self._call(lambda: self._read_all(servos, start.address, length))
-            if missing is None:
-                break
-            if attempt == TRIES - 1:
-                raise RobotError(self._silent(missing))
+        rows = self._repeated(lambda: self._read_all(servos, start.address, length))
         return np.array(
             [
                 [
@@ -155,18 +151,36 @@ class Bus:
             lines += [f"{self._name(servo)}: {words}" for bit, words in HARDWARE_ERRORS.items() if bits & bit]
         return lines
 
-    def _read_all(self, servos: Sequence[int], address: int, length: int) -> tuple[list[bytes], int | None]:
-        """The answers, and the first servo without one."""
+    def _read_all(self, servos: Sequence[int], address: int, length: int) -> tuple[list[bytes], int, int]:
+        """The answers, the result, and the servo that it is about."""
         rows: list[bytes] = []
         result = self._packets.syncReadTx(self._port, address, length, list(servos), len(servos), False)
         for servo in servos:
             data = []
             if result == sdk.COMM_SUCCESS:
                 data, result, _ = self._packets.readRx(self._port, servo, length)
-            if result != sdk.COMM_SUCCESS or len(data) != length:
-                return rows, servo
+                if result == sdk.COMM_SUCCESS and len(data) != length:
+                    result = sdk.COMM_RX_CORRUPT
+            if result != sdk.COMM_SUCCESS:
+                break
             rows.append(bytes(data))
-        return rows, None
+        return rows, result, servo
+
+    def _repeated(self, transaction: Callable[[], tuple[Any, int, int]]) -> Any:
+        """What a transaction returns, tried again while there is time; it returns a value, a result, and a servo."""
+        start = time.monotonic()
+        while True:
+            value, result, servo = self._call(transaction)
+            if result == sdk.COMM_SUCCESS:
+                return value
+            if (time.monotonic() - start) * 1e3 > RETRY_MS:
+                damaged = result == sdk.COMM_RX_CORRUPT
+                what = "answers with damaged packets" if damaged else "does not answer"
+                name = self._name(servo)
+                raise RobotError(
+                    f"{self.port}: {name} {what}; check its cable, the power supply, and that no other program uses "
+                    "the port"
+                )
 
     def _call(self, transaction: Callable):
         """A transaction with the SDK; a port that was unplugged raises `RobotError`."""
@@ -175,17 +189,11 @@ class Bus:
         try:
             self._port.is_using = False  # a transaction that raised left it set
             return transaction()
-        except (OSError, serial.SerialException, TypeError) as error:  # TypeError: pyserial after an unplugged port
+        except UNPLUGGED as error:
             raise RobotError(f"{self.port} was unplugged ({error}); plug it in and run again") from None
 
     def _name(self, servo: int) -> str:
         return f"servo {servo} ({self._names[servo]})" if servo in self._names else f"servo {servo}"
-
-    def _silent(self, servo: int) -> str:
-        return (
-            f"{self.port}: {self._name(servo)} does not answer; check its cable, the power supply, and that no other "
-            "program uses the port"
-        )
 
 
 class _MonotonicPort(sdk.PortHandler):

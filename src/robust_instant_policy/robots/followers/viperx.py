@@ -56,7 +56,8 @@ class ViperX:
     ):
         self.name, self._bus = name, dxl.Bus(port, baud, SERVOS)
         self._travel, self._current, self._closed, self._open = finger_travel, gripper_current, closed, opened
-        self._readings, self._clock, self._faults = 0, 0.0, ()
+        self._readings, self._clock = 0, 0.0
+        self._faults: tuple[str, ...] = ()
         self._tick: int | None = None
         self._watched = False
 
@@ -162,7 +163,7 @@ class ViperX:
         """Write to a register that is locked while the torque is on. Refused where an arm would fall."""
         if self._bus.read(servo, dxl.TORQUE):
             raise RobotError(
-                f"{self._bus.port}: servo {servo} ({SERVOS[servo]}) is set up for something else and holds the arm; put "
-                "the arm into its rest pose, switch its power off and on, and run again"
+                f"{self._bus.port}: servo {servo} ({SERVOS[servo]}) is set up for something else and holds the arm; "
+                "put the arm into its rest pose, switch its power off and on, and run again"
             )
         self._bus.write(servo, register, value)
