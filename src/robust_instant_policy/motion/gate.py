@@ -22,7 +22,6 @@ TOLERANCE = 1.05  # of speeds and accelerations that were planned at the limit
 STALE_S = 0.1  # without a new reading; the watchdog's time
 BLOCKED_S = 1.5  # that a gripper may take to open
 BLOCKED_SHARE = 0.3  # of its travel that it may lack then
-START_RAD = 0.1  # between the first command and the measured joints
 
 
 class Gate:
@@ -50,8 +49,8 @@ class Gate:
         """The last command of each arm."""
         return self._last
 
-    def admit(self, commands: Sequence[Command]) -> None:
-        """Raise `UnreachableError` for ``commands`` that are not numbers, out of range, too fast or a jump."""
+    def admit(self, commands: Sequence[Command]) -> Sequence[Command]:
+        """Return ``commands``; raises `UnreachableError` if one is not a number, out of range, too fast or a jump."""
         joints = np.stack([command.joints for command in commands])
         fingers = np.array([command.finger_travel for command in commands])
         change = joints - np.stack([command.joints for command in self._last])
@@ -71,6 +70,7 @@ class Gate:
                 if value > limit * TOLERANCE:
                     raise UnreachableError(exceeded(arm.name, what, value, limit, unit, key))
         self._last, self._change = list(commands), change
+        return commands
 
     def limited(self, wanted: Sequence[Command]) -> list[Command]:
         """What the arms may do towards ``wanted``: within speeds, accelerations and ranges, or not at all.

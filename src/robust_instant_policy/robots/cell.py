@@ -177,6 +177,12 @@ class CellConfig:
     camera_calibration: Path | None
     emulation: Mapping[str, Any] | None = field(default=None)
 
+    def emulation_section(self) -> Section:
+        """The table [emulation]; raises `CellError` for a cell with real devices."""
+        if self.emulation is None:
+            raise CellError(f"{self.path} has no table [emulation]: its devices are real")
+        return Section(self.emulation, f"{self.path}: emulation")
+
     @property
     def pace(self) -> float:
         """How much faster than time the cell runs; 1 for real devices."""

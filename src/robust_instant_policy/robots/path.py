@@ -69,7 +69,7 @@ class MeasuredPath:
                     if travel < EMPTY_TRAVEL_M and load < EMPTY_LOAD:
                         seconds = start / self.rate_hz
                         lines.append(
-                            f"the gripper {name} closed on nothing after {seconds:.1f} s: {2e3 * travel:.1f} mm between "
-                            f"its fingers, {100 * load:.0f}% of its force"
+                            f"the gripper {name} closed on nothing after {seconds:.1f} s: {2e3 * travel:.1f} mm "
+                            f"between its fingers, {100 * load:.0f}% of its force"
                         )
         return lines

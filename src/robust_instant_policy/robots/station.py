@@ -3,7 +3,7 @@
         ┌──────────── every 1 / rate_hz ────────────┐
 states ─▶ Gate.judge ─▶ next command ─▶ Gate.admit ─▶ followers
              │                              │
-             └──── StoppedError, RobotError ┴──▶ all followers stop and hold
+             └───── StoppedError, RobotError ──┴──▶ all followers stop and hold
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ import contextlib
 import gc
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from types import TracebackType
 
 import numpy as np
 
-from robust_instant_policy.errors import StoppedError
+from robust_instant_policy.errors import RobotError, StoppedError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Motion
 from robust_instant_policy.motion.gate import Gate
@@ -28,7 +29,17 @@ from robust_instant_policy.robots.models import arm_of
 from robust_instant_policy.robots.path import MeasuredPath
 from robust_instant_policy.robots.signals import StopRequest
 
-BRAKING_STEPS = 12  # control steps in which a motion that goes well is brought to rest
+BRAKING_STEPS = 12  # control steps in which a motion is brought to rest when somebody asks for it
+BLENDING_STEPS = 25  # in which the difference between measured joints and the first command is taken back
+START_RAD = 0.1  # largest such difference
+
+
+@dataclass(frozen=True)
+class Played:
+    """The measured path of a motion, and why it was ``stopped``, empty where it came to its end."""
+
+    path: MeasuredPath
+    stopped: str
 
 
 class Ticker:
@@ -83,48 +94,56 @@ class Station:
         for follower in self.followers:
             follower.stop()
 
-    def play(self, motion: Motion, stop: StopRequest) -> MeasuredPath:
+    def play(self, motion: Motion, stop: StopRequest) -> Played:
         """Execute a motion that `motion.guard` has checked, from where the arms are now.
 
-        A request to ``stop`` brakes the motion on its path and raises `StoppedError`; so does anything that is wrong,
-        after the arms were stopped. The path until then is the error's ``path``.
+        A request to ``stop`` brakes the motion on its path; anything that is wrong stops the arms at once.
         """
         log = _Log(len(motion.joints) + BRAKING_STEPS, motion.joints.shape[1:])
-        position, stride, last = -1.0, 1.0, len(motion.joints) - 1
+        last = len(motion.joints) - 1
+        position, stride, step, offset = -1.0, 1.0, 0, np.zeros(motion.joints.shape[1:])
 
-        def command() -> list[Command] | None:
-            nonlocal position, stride
+        def command(states: Sequence[ArmState]) -> list[Command] | None:
+            nonlocal position, stride, step, offset
+            if step == 0:
+                offset = self._start_offset(motion, states)
             if stop.reason:
                 stride -= 1 / BRAKING_STEPS
             if position >= last or stride <= 0:
                 return None
-            position = min(position + stride, float(last))
-            return _between(motion, position)
+            position, step = min(position + stride, float(last)), step + 1
+            share = max(1 - step / BLENDING_STEPS, 0.0)
+            return _between(motion, position, share**3 * (10 - 15 * share + 6 * share**2) * offset)
 
+        stopped = ""
         try:
-            self._loop(lambda states: command(), self.gate.admit, log)
-        except Exception as error:
-            error.path = log.path(self._pace)  # type: ignore[attr-defined]
-            raise
-        if stop.reason:
-            stopped = StoppedError(f"stopped ({stop.reason}); the arms hold their position")
-            stopped.path = log.path(self._pace)  # type: ignore[attr-defined]
-            raise stopped
-        return log.path(self._pace)
+            self._loop(command, self.gate.admit, log)
+            if stop.reason:
+                stopped = f"stopped ({stop.reason})"
+        except (RobotError, UnreachableError) as error:
+            stopped = str(error)
+        return Played(log.path(self.rate_hz), stopped)
 
     def lead(self, command: Callable[[Sequence[ArmState]], Sequence[Command] | None]) -> None:
         """Let the arms follow ``command(states)``, slowed down by `Gate.limited`, until it returns None."""
         self._loop(command, self.gate.limited, None)
 
-    @property
-    def _pace(self) -> float:
-        """Rate of the loop, Hz of the machine's clock: an emulated cell may be faster than time."""
-        return self.rate_hz * self.config.pace
+    def _start_offset(self, motion: Motion, states: Sequence[ArmState]) -> FloatArray:
+        """Measured joints ``(A, J)`` minus the first ones of ``motion``; raises `StoppedError` where they are far."""
+        offset = np.stack([state.joints for state in states]) - motion.joints[0]
+        worst = np.abs(offset).max(axis=1)
+        arm = int(np.argmax(worst))
+        if worst[arm] > START_RAD:
+            raise StoppedError(
+                f"{self.arms[arm].name} is {worst[arm]:.2f} rad away from where the motion begins, at most {START_RAD} "
+                "are accepted; park it again"
+            )
+        return offset
 
     def _loop(
         self,
         command: Callable[[Sequence[ArmState]], Sequence[Command] | None],
-        checked: Callable[[Sequence[Command]], Sequence[Command] | None],
+        checked: Callable[[Sequence[Command]], Sequence[Command]],
         log: _Log | None,
     ) -> None:
         states = self.states()
@@ -132,20 +151,18 @@ class Station:
         collecting = gc.isenabled()
         gc.disable()  # a collection may take longer than a control step
         try:
-            ticker = Ticker(self._pace)
+            ticker = Ticker(self.rate_hz * self.config.pace)
             while (wanted := command(states)) is not None:
                 now = ticker.wait()
-                sent = checked(wanted) or wanted
+                sent = checked(wanted)
                 for follower, one in zip(self.followers, sent, strict=True):
                     follower.command(one)
                 states = self.states()
                 if log is not None:
                     log.add(now, sent, states)
                 self.gate.judge(states)
-        except BaseException:
-            self.stop()
-            raise
         finally:
+            self.stop()  # also after the last command: the servos' watchdog would not let them go on later
             if collecting:
                 gc.enable()
 
@@ -174,10 +191,10 @@ class _Log:
         return MeasuredPath(rate_hz, self._commanded[:n], self._measured[:n], self._loads[:n], seconds)
 
 
-def _between(motion: Motion, position: float) -> list[Command]:
-    """The commands at a fractional index of ``motion``."""
+def _between(motion: Motion, position: float, offset: FloatArray) -> list[Command]:
+    """The commands at a fractional index of ``motion``, with an ``offset (A, J)`` of the joints."""
     row, share = int(position), position - int(position)
     after = min(row + 1, len(motion.joints) - 1)
-    joints: FloatArray = motion.joints[row] + share * (motion.joints[after] - motion.joints[row])
+    joints: FloatArray = motion.joints[row] + share * (motion.joints[after] - motion.joints[row]) + offset
     fingers = motion.fingers[row] + share * (motion.fingers[after] - motion.fingers[row])
     return [Command(one, float(travel)) for one, travel in zip(joints, fingers, strict=True)]

@@ -38,7 +38,7 @@ OVERLOAD = 0x20
 
 
 class ServoBus:
-    """Serves Protocol 2.0 for arm ``index`` of ``twin``; ``port`` is the path to open."""
+    """Serves Protocol 2.0 for arm ``index`` of ``twin``. See `server.Device`."""
 
     def __init__(self, twin: SharedTwin, index: int, finger_travel: float):
         self._twin, self._index, self._travel = twin, index, finger_travel
@@ -46,7 +46,7 @@ class ServoBus:
         self._master, slave = pty.openpty()
         tty.setraw(self._master)
         tty.setraw(slave)
-        self.port, self._slave = os.ttyname(slave), slave
+        self._slave = slave
         self._crc = dynamixel_sdk.PacketHandler(2.0).updateCRC
         self._memory = {servo: bytearray(REGISTERS) for servo in SERVOS}
         self._heard = time.monotonic()
@@ -60,6 +60,10 @@ class ServoBus:
             self._put(servo, dxl.TEMPERATURE, 35)
         self._measure()
         threading.Thread(target=self._serve, daemon=True).start()
+
+    @property
+    def options(self) -> dict[str, str]:
+        return {"port": os.ttyname(self._slave)}
 
     def unplug(self) -> None:
         """Pull the cable: the port is gone."""
