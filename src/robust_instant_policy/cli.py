@@ -15,6 +15,7 @@ from robust_instant_policy.errors import RipError
 # Each command is a module in `commands`. Only the one that runs is imported, because others may need more packages.
 COMMANDS = {
     "demo": "record demonstrations, plan in a new scene, execute, and write a report",
+    "new-task": "write the template of a task of your own, or check one",
     "record": "record demonstrations into a dataset folder",
     "check": "check demonstrations, and a new scene, against each other, and name likely mistakes",
     "plan": "plan for one observation and write plan.json; nothing is executed",
@@ -78,7 +79,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         command = commands.add_parser(name, help=summary, description=summary)
         command.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
         if name == chosen:
-            module = importlib.import_module(f"robust_instant_policy.commands.{name}")
+            module = importlib.import_module(f"robust_instant_policy.commands.{name.replace('-', '_')}")
             module.add_arguments(command)
             command.set_defaults(run=module.run)
     return parser.parse_args(arguments)

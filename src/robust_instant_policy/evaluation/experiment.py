@@ -27,7 +27,7 @@ from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.evaluation.work import Outcome, Planned, SceneWork, Setup, Workers
 from robust_instant_policy.evaluation.workbench import Workbench
-from robust_instant_policy.files import lock_folder, make_folder, write_whole
+from robust_instant_policy.files import file_stem, lock_folder, make_folder, write_whole
 from robust_instant_policy.llm import model_name
 from robust_instant_policy.perception.network import choose_network, resolve_features
 from robust_instant_policy.perception.settings import PAPER_SIMULATION
@@ -168,7 +168,7 @@ def plan_file(scene: Scene, variant: Variant) -> str:
 
 def training_file(task: str, variant: Variant) -> str:
     """Path in a run's folder of the figure about the training of ``variant`` on ``task``."""
-    return f"{TRAINING_FOLDER}/{task}-{variant.file_name}.svg"
+    return f"{TRAINING_FOLDER}/{file_stem(task)}-{variant.file_name}.svg"
 
 
 def missing_work(

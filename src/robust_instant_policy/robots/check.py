@@ -55,9 +55,8 @@ def _arms(config: CellConfig) -> list[tuple[str, bool]]:
 
 
 def _timing(name: str, slow: float, rate_hz: float) -> str:
-    return (
-        f"{name}: 95% of the states within {1e3 * slow:.1f} ms, a control step has {1e3 / rate_hz:.0f} ms"
-        + ("" if slow + JITTER_S < 1 / rate_hz else "; set the adapter's latency timer to 1 ms, or lower rate_hz")
+    return f"{name}: 95% of the states within {1e3 * slow:.1f} ms, a control step has {1e3 / rate_hz:.0f} ms" + (
+        "" if slow + JITTER_S < 1 / rate_hz else "; set the adapter's latency timer to 1 ms, or lower rate_hz"
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from itertools import count
 from typing import Any, Protocol
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import RipError, UnreachableError
+from robust_instant_policy.errors import RipError, UnknownNameError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.waypoints import plan_onward, plan_poses, plan_waypoints
@@ -43,6 +44,17 @@ class TaskSpec:
     expert: Expert
     object_sets: tuple[str, ...] = ("seen",)
     asset_sources: tuple[str, ...] = ("code",)
+
+
+def spec_of(module: str, objects: str, assets: str) -> TaskSpec:
+    """``SPEC`` of ``module``, if it has the set of ``objects`` and the source of ``assets``; else raises
+    `UnknownNameError`."""
+    spec: TaskSpec = import_module(module).SPEC
+    if objects not in spec.object_sets:
+        raise UnknownNameError(f"set of objects of {spec.name}", objects, spec.object_sets)
+    if assets not in spec.asset_sources:
+        raise UnknownNameError(f"source of assets of {spec.name}", assets, spec.asset_sources)
+    return spec
 
 
 class Cell(Protocol):
