@@ -120,12 +120,12 @@ def test_a_plan_begins_at_the_measured_state_and_does_the_task(planner):
     try:
         seen = task.reset(1_000_000)
         robot = Embodiment.simulated(task.end_effectors, [arm.triangle for arm in task.arms])
-        state = robot.to_robot(task.joints())
+        state = robot.to_robot(task.cell.measured())
         actions = planner(0.01).plan(seen.rgb, seen.depth, state)
         assert np.abs(actions[0] - state)[:6].max() < 1.0
         for action in actions.astype(np.float32):
-            task.advance(robot.from_robot(action))
-        assert task.failure() == ""
+            task.cell.advance(robot.from_robot(action))
+        assert task.cell.failure() == ""
     finally:
         task.close()
 

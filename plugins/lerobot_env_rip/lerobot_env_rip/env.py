@@ -56,18 +56,18 @@ class RipEnv(gymnasium.Env):
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
         self._held = self._held + 1 if self._action is not None and np.array_equal(action, self._action) else 0
         self._action = np.array(action)
-        self._task.advance(self._embodiment.from_robot(action))
+        self._task.cell.advance(self._embodiment.from_robot(action))
         self._steps += 1
         if self._live_images:
             self._seen = self._task.look()
         terminated = self._held >= HOLD_SECONDS * self._task.control_hz
         truncated = self._steps >= self._max_episode_steps
-        success = (terminated or truncated) and not self._task.failure()
+        success = (terminated or truncated) and not self._task.cell.failure()
         return self._observe(), float(success), terminated, truncated, {"is_success": success}
 
     def render(self) -> np.ndarray:
         if self._frame is None or self._steps % VIDEO_EVERY == 0:
-            self._frame = self._task.video_frame()
+            self._frame = self._task.cell.video_frame()
         return self._frame
 
     def close(self) -> None:
@@ -75,5 +75,5 @@ class RipEnv(gymnasium.Env):
 
     def _observe(self) -> dict[str, Any]:
         depth = np.rint(np.nan_to_num(self._seen.depth) * 1000).astype(np.uint16)
-        state = self._embodiment.to_robot(self._task.joints())
+        state = self._embodiment.to_robot(self._task.cell.measured())
         return {"agent_pos": state, "pixels": {"top": self._seen.rgb}, "images.top_depth": depth}

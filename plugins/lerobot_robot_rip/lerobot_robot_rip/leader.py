@@ -72,7 +72,7 @@ class RipTwinLeader(Teleoperator):
         while True:
             demonstration, home = twin.demonstration(), twin.home()
             yield from demonstration
-            print(f"leader: scene {twin.seed}: {twin.task.failure() or 'done'}; press n", flush=True)
+            print(f"leader: scene {twin.seed}: {twin.task.cell.failure() or 'done'}; press n", flush=True)
             yield from [demonstration[-1]] * pause
             yield from (demonstration[-1] + share * (home - demonstration[-1]) for share in np.arange(1, back) / back)
             twin.lay_out(twin.seed + 1)

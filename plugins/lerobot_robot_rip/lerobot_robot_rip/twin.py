@@ -88,7 +88,7 @@ class RipTwin(Robot):
         RipTwin.connected = self
 
     def disconnect(self) -> None:
-        print(f"twin: scene {self.seed}: {self.task.failure() or 'done'}", flush=True)
+        print(f"twin: scene {self.seed}: {self.task.cell.failure() or 'done'}", flush=True)
         RipTwin.connected = None
         self.task.close()
 
@@ -110,9 +110,10 @@ class RipTwin(Robot):
         return self.embodiment.to_robot(Motion.at_home(self.task.arms).commands[0])
 
     def get_observation(self) -> dict[str, Any]:
-        poses = self.task.tool_poses()
+        cell = self.task.cell
+        poses = cell.tool_poses()
         turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
-        numbers = [*self.embodiment.to_robot(self.task.joints()), *np.concatenate([poses[:, :3, 3], turns], 1).ravel()]
+        numbers = [*self.embodiment.to_robot(cell.measured()), *np.concatenate([poses[:, :3, 3], turns], 1).ravel()]
         seen = self.task.look()
         observation = dict(zip([*self.embodiment.axes, *self._pose_axes], map(float, numbers), strict=True))
         millimetres = np.rint(np.nan_to_num(seen.depth) * 1000).astype(np.uint16)
@@ -128,6 +129,6 @@ class RipTwin(Robot):
         command = self.embodiment.from_robot([action[axis] for axis in self.embodiment.axes])
         steps = round(self.task.control_hz / self.config.fps)
         for share in np.arange(1, steps + 1) / steps:
-            self.task.advance((1 - share) * self._command + share * command)
+            self.task.cell.advance((1 - share) * self._command + share * command)
         self._command = command
         return action

@@ -110,8 +110,10 @@ class StepFrames:
         return rows.reshape(len(actions), -1)
 
     def decode(self, keypoints: FloatArray, numbers: FloatArray) -> FloatArray:
-        """The actions ``(T', 10·A)`` that the first T' steps' ``numbers`` mean in the scene of ``keypoints (K, 3)``: the
-        inverse of `encode`, but without the jumps where frames change (`joins`)."""
+        """The actions ``(T', 10·A)`` that the first T' steps' ``numbers`` mean in the scene of ``keypoints (K, 3)``.
+
+        The inverse of `encode`, but without the jumps where frames change (`joins`).
+        """
         rows = numbers.reshape(len(numbers), self.num_arms, ACTION_DIM).copy()
         for poses, row in zip(self.poses(keypoints), rows, strict=False):
             for pose, arm in zip(poses, row, strict=True):

@@ -61,8 +61,9 @@ class Cell(Protocol):
     """A gymnasium environment that holds a scene with A arms; see the methods of the same names in `Task`.
 
     ``advance`` takes one control step towards ``command (A·(J + 1),)``: for each arm the joint angles and the finger
-    travel, rad and m; ``joints`` measures the same. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure``
-    is the reason why the task is not done, empty if it is done. ``layout`` has the draws of the scene.
+    travel, rad and m; ``measured`` returns the same quantities, ``grip_loads (A,)`` each gripper's share of its force
+    limit. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is not done,
+    empty if it is done. ``layout`` has the draws of the scene.
     """
 
     layout: Layout
@@ -71,7 +72,8 @@ class Cell(Protocol):
     def photograph(self) -> Observation: ...
     def scene_truth(self) -> SceneTruth: ...
     def advance(self, command: FloatArray) -> None: ...
-    def joints(self) -> FloatArray: ...
+    def measured(self) -> FloatArray: ...
+    def grip_loads(self) -> FloatArray: ...
     def tool_poses(self) -> FloatArray: ...
     def video_frame(self) -> np.ndarray: ...
     def failure(self) -> str: ...
@@ -120,7 +122,7 @@ class SimulatedTask:
 
     def reset(self, seed: int) -> Observation:
         self._rebuild(seed)
-        return self._photograph()
+        return self.look()
 
     def execute(self, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
         if self._seed is None:
@@ -143,7 +145,7 @@ class SimulatedTask:
         motion = Motion.at_home(self._arms)
         steps, worst, failure = 0, 0.0, ""
         while steps < max_seconds * control_hz and not failure:
-            waypoints = controller.act(self._photograph().rgb, self._action(motion.closed[-1]))
+            waypoints = controller.act(self.look().rgb, self._action(motion.closed[-1]))
             if waypoints is None:
                 break
             try:
@@ -167,27 +169,6 @@ class SimulatedTask:
         """The working arms, with the start pose of the present scene as their home."""
         return self._arms
 
-    def joints(self) -> FloatArray:
-        """Measured joint angles and finger travel of each arm ``(A·(J + 1),)``, rad and m."""
-        return self._cell.joints()
-
-    def tool_poses(self) -> FloatArray:
-        """Measured tool poses ``(A, 4, 4)``."""
-        return self._cell.tool_poses()
-
-    def look(self) -> Observation:
-        """What the camera sees now."""
-        return self._photograph()
-
-    def advance(self, command: FloatArray) -> None:
-        """One control step towards ``command (A·(J + 1),)``, joint angles and finger travel of each arm."""
-        self._fresh = False
-        self._cell.advance(command)
-
-    def failure(self) -> str:
-        """Why the task is not done now; empty if it is done."""
-        return self._cell.failure()
-
     def expert_path(self) -> tuple[FloatArray, np.ndarray]:
         """Tool poses ``(N, A, 4, 4)`` and gripper commands ``(N, A)`` of the demonstrator in the scene of `reset`."""
         rng = np.random.default_rng([self._seed or 0, HAND_STREAM])
@@ -196,10 +177,6 @@ class SimulatedTask:
         if self._level.turn:
             strokes = shorter_turns(strokes)
         return perform(home, strokes, rng, self._timing.control_hz)
-
-    def video_frame(self) -> Image:
-        """RGB frame ``(H, W, 3)`` uint8 of the camera for videos."""
-        return self._cell.video_frame()
 
     def demonstrate(self, seed: int, with_images: bool = False, every: int = 1) -> Attempt:
         observation = self.reset(seed)
@@ -219,6 +196,11 @@ class SimulatedTask:
         demonstration = Demonstration(observation, trajectory, self.record_hz / every, self.name, seed)
         return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
 
+    @property
+    def cell(self) -> Cell:
+        """The environment, as physics of an emulated robot."""
+        return self._cell
+
     def scene_truth(self) -> SceneTruth:
         """Ground truth of the camera's pixels, to measure perception; not for policies."""
         return self._cell.scene_truth()
@@ -232,8 +214,8 @@ class SimulatedTask:
         home = self._cell.layout.home(np.stack([arm.home for arm in self._usual_arms]))
         self._arms = [replace(arm, home=joints) for arm, joints in zip(self._usual_arms, home, strict=True)]
 
-    def _photograph(self) -> Observation:
-        """The camera's image, with the noise of the level."""
+    def look(self) -> Observation:
+        """What the camera sees now, with the noise of the level."""
         seen, self._images = self._cell.photograph(), self._images + 1
         if self._level.camera is None:
             return seen
@@ -277,7 +259,7 @@ class SimulatedTask:
 
         def before_step() -> None:
             if next(step) in steps:
-                images.append(self._photograph().rgb)
+                images.append(self.look().rgb)
 
         return before_step
 

@@ -23,6 +23,7 @@ from robust_instant_policy.tasks.aloha.robot import (
     CLOSED_M,
     FINGER_TRAVEL_M,
     FINGERS,
+    GRIP_FORCE_N,
     HOME_JOINTS,
     PARKED_JOINTS,
     TOOL,
@@ -150,7 +151,7 @@ class AlohaEnv(gymnasium.Env):
             self.data.actuator(f"{arm}/{FINGERS[0]}").ctrl = CLOSED_M + travel
         mujoco.mj_step(self.model, self.data, round(SETTLE_SECONDS / TIMESTEP_S))
         mujoco.mj_forward(self.model, self.data)
-        self._joints_before = self.joints()
+        self._joints_before = self._joints()
         return self._observation(), {}
 
     def step(self, action: FloatArray) -> tuple[dict, float, bool, bool, dict]:
@@ -160,7 +161,7 @@ class AlohaEnv(gymnasium.Env):
 
     def advance(self, command: FloatArray) -> None:
         """One control step, with joint angles and finger travel ``(7·A,)`` commanded, without evaluation."""
-        self._joints_before = self.joints()
+        self._joints_before = self._joints()
         for side, (*angles, travel) in zip(self.end_effectors, command.reshape(-1, len(ARM_JOINTS) + 1), strict=True):
             for joint, angle in zip(ARM_JOINTS, angles, strict=True):
                 self.data.actuator(f"{ARMS[side]}/{joint}").ctrl = angle
@@ -222,7 +223,7 @@ class AlohaEnv(gymnasium.Env):
 
     def arm_is_still(self) -> bool:
         """Whether no joint of a working arm moved faster than `STILL_RAD_S` over the last control step."""
-        moved = np.abs(self.joints() - self._joints_before).reshape(-1, len(ARM_JOINTS) + 1)[:, : len(ARM_JOINTS)]
+        moved = np.abs(self._joints() - self._joints_before).reshape(-1, len(ARM_JOINTS) + 1)[:, : len(ARM_JOINTS)]
         return bool(moved.max() * CONTROL_HZ <= STILL_RAD_S)
 
     def is_still(self, body: str) -> bool:
@@ -243,7 +244,16 @@ class AlohaEnv(gymnasium.Env):
         """Whether both fingers of the arm on a ``side`` press on a body."""
         return all(self.touch(body, f"{ARMS[side]}/{finger}_link") > HELD_N for finger in FINGERS)
 
-    def joints(self) -> FloatArray:
+    def measured(self) -> FloatArray:
+        """Joint angles and finger travel of the working arms, ``(7·A,)``."""
+        return self._joints()
+
+    def grip_loads(self) -> FloatArray:
+        """Force of each working gripper as a share of its limit, ``(A,)``."""
+        forces = [self.data.actuator(f"{ARMS[side]}/{FINGERS[0]}").force[0] for side in self.end_effectors]
+        return np.abs(forces) / (2 * GRIP_FORCE_N)
+
+    def _joints(self) -> FloatArray:
         """Joint angles and finger travel of the working arms, in the order of commands ``(7·A,)``."""
         reached: list[float] = []
         for side in self.end_effectors:
@@ -252,7 +262,7 @@ class AlohaEnv(gymnasium.Env):
         return np.array(reached)
 
     def _observation(self) -> dict[str, np.ndarray]:
-        seen: dict[str, np.ndarray] = {"joints": self.joints().astype(np.float32)}
+        seen: dict[str, np.ndarray] = {"joints": self._joints().astype(np.float32)}
         if self.obs_mode == "rgbd":
             photograph = self.photograph()
             seen |= {"rgb": photograph.rgb, "depth": photograph.depth}
