@@ -24,10 +24,10 @@ from robust_instant_policy.evaluation.store import read_results
 from robust_instant_policy.tasks import make_task
 
 TABLE = Path(__file__).parent.parent / "docs" / "tables" / "lerobot_eval.md"
-TASKS = (
-    "pick-banana push-cube open-drawer close-cabinet turn-faucet "
-    "aloha-pick-banana aloha-hang aloha-cup-upright aloha-sweep aloha-pick-place"
-).split()
+TASKS = [
+    "pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet",
+    "aloha-pick-banana", "aloha-hang", "aloha-cup-upright", "aloha-sweep", "aloha-pick-place",
+]  # fmt: skip
 MODELS = {"hand-e": "ur5e-hande", "left": "viperx-left", "right": "viperx-right"}
 
 
