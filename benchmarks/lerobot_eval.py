@@ -25,8 +25,8 @@ from robust_instant_policy.tasks import make_task
 
 TABLE = Path(__file__).parent.parent / "docs" / "tables" / "lerobot_eval.md"
 TASKS = [
-    "pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet",
-    "aloha-pick-banana", "aloha-hang", "aloha-cup-upright", "aloha-sweep", "aloha-pick-place",
+    "pick-banana", "aloha-pick-banana", "push-cube", "aloha-sweep", "open-drawer", "aloha-cup-upright",
+    "close-cabinet", "aloha-hang", "turn-faucet", "aloha-pick-place",
 ]  # fmt: skip
 MODELS = {"hand-e": "ur5e-hande", "left": "viperx-left", "right": "viperx-right"}
 
@@ -35,7 +35,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--lerobot", type=Path, required=True)
     parser.add_argument("--tasks", nargs="+", default=TASKS)
-    parser.add_argument("--episodes", type=int, default=5)
+    parser.add_argument("--episodes", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("runs/lerobot-eval"))
     parser.add_argument("--llm", default="embedded")
     options = parser.parse_args()

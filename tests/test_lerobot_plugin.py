@@ -206,3 +206,50 @@ def test_folder_without_demonstrations_is_one_line(tmp_path, monkeypatch, capsys
     monkeypatch.setattr(sys, "argv", ["x", "--demonstrations=/nowhere", "--arms=[]", f"--out={tmp_path / 'policy'}"])
     assert main() == 1 + 1
     assert "there is no folder '/nowhere'" in capsys.readouterr().err
+
+
+@in_lerobot
+def test_the_depth_camera_is_one_of_lerobots_and_its_depth_is_aligned():
+    pytest.importorskip("pyrealsense2")
+    from lerobot_robot_rip import RipRealSense, RipRealSenseConfig
+
+    from tests.test_robots_cameras import INTRINSICS, SoftwareDevice, grey
+
+    device = SoftwareDevice(grey)
+    camera = RipRealSense(RipRealSenseConfig(), device.device)
+    try:
+        camera.connect()
+        assert camera.use_depth  # LeRobot's arms then record NAME_depth, too
+        first, depth = camera.read_latest(), camera.read_latest_depth()
+        assert first.shape == (480, 640, 3)
+        assert (depth.shape, depth.dtype) == ((480, 640, 1), np.uint16)
+        assert np.median(depth) == pytest.approx(800, abs=1)
+        assert camera.intrinsics == pytest.approx(INTRINSICS)
+        assert (camera.async_read() != first).any()
+    finally:
+        camera.disconnect()
+        device.stop()
+
+
+@in_lerobot
+def test_the_leader_demonstrates_brings_the_arms_home_and_lays_out_the_next_scene(capsys):
+    from lerobot_robot_rip import RipTwin, RipTwinConfig, RipTwinLeader, RipTwinLeaderConfig
+
+    robot, leader = RipTwin(RipTwinConfig(id="test")), RipTwinLeader(RipTwinLeaderConfig(id="test", pause_s=0.4))
+    leader.connect()
+    robot.connect()
+    try:
+        said, steps = "", 0
+        while "next scene" not in said:
+            action = leader.get_action()
+            assert action.keys() == robot.action_features.keys()
+            robot.send_action(action)
+            said, steps = said + capsys.readouterr().out, steps + 1
+        assert "scene 0: done" in said
+        assert robot.seed == 1
+        assert 30 < steps < 100
+        seen = robot.get_observation()
+        assert seen.keys() == robot.observation_features.keys()
+        assert 500 < np.median(seen["top_depth"]) < 1000
+    finally:
+        robot.disconnect()
