@@ -62,8 +62,8 @@ class TaskTwin:
     def __init__(self, task: Any, seed: int, num_arms: int):
         if len(task.end_effectors) != num_arms:
             raise CellError(
-                f"the task {task.name} has {len(task.end_effectors)} arms ({', '.join(task.end_effectors)}), the cell's "
-                f"file {num_arms}"
+                f"the task {task.name} has {len(task.end_effectors)} arms ({', '.join(task.end_effectors)}), "
+                f"the cell's file {num_arms}"
             )
         task.reset(seed)
         self._cell = task.cell

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,17 +18,20 @@ EMPTY_LOAD = 0.5  # share of the force limit; fingers that press on something th
 CLOSING_S = 0.4  # of a closed command before the width is judged
 CLOSED_M = 1e-6
 
-ARRAYS = ("rate_hz", "commanded", "measured", "loads", "seconds")
+ARRAYS = ("rate_hz", "commanded", "measured", "commanded_tools", "measured_tools", "loads", "seconds")
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPath:
     """A run at ``rate_hz``: ``commanded`` and ``measured (N, A, J + 1)`` joints, rad, and finger travel, metres;
+    ``commanded_tools`` and ``measured_tools (N, A, 3)``, the points between the fingertips, metres in the world;
     ``loads (N, A)`` of the grippers, 0 to 1; ``seconds (N,)`` since the start, of the machine's clock."""
 
     rate_hz: float
     commanded: FloatArray
     measured: FloatArray
+    commanded_tools: FloatArray
+    measured_tools: FloatArray
     loads: FloatArray
     seconds: FloatArray
 
@@ -52,11 +56,16 @@ class MeasuredPath:
         return float(np.abs(self.commanded - self.measured)[..., :-1].max(initial=0.0))
 
     @property
+    def tool_errors(self) -> FloatArray:
+        """Distances ``(N, A)``, metres, between commanded and measured tools."""
+        return np.linalg.norm(self.commanded_tools - self.measured_tools, axis=-1)
+
+    @property
     def jitter(self) -> FloatArray:
         """Deviation ``(N - 1,)``, seconds, of the time between two commands from that of the rate."""
         return np.abs(np.diff(self.seconds) - 1 / self.rate_hz)
 
-    def empty_grasps(self, names: tuple[str, ...]) -> list[str]:
+    def empty_grasps(self, names: Sequence[str]) -> list[str]:
         """One line for each time that a gripper closed and held nothing."""
         lines = []
         for arm, name in enumerate(names):

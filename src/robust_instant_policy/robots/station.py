@@ -19,7 +19,7 @@ import numpy as np
 
 from robust_instant_policy.errors import RobotError, StoppedError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.motion.arm import Motion
+from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.gate import Gate
 from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.cell import CellConfig
@@ -122,7 +122,7 @@ class Station:
                 stopped = f"stopped ({stop.reason})"
         except (RobotError, UnreachableError) as error:
             stopped = str(error)
-        return Played(log.path(self.rate_hz), stopped)
+        return Played(log.path(self.rate_hz, self.arms), stopped)
 
     def lead(self, command: Callable[[Sequence[ArmState]], Sequence[Command] | None]) -> None:
         """Let the arms follow ``command(states)``, slowed down by `Gate.limited`, until it returns None."""
@@ -185,10 +185,18 @@ class _Log:
         self._seconds[row] = now
         self._count += 1
 
-    def path(self, rate_hz: float) -> MeasuredPath:
+    def path(self, rate_hz: float, arms: Sequence[Arm]) -> MeasuredPath:
         n = self._count
+        commanded, measured = self._commanded[:n], self._measured[:n]
         seconds = self._seconds[:n] - self._seconds[0] if n else np.zeros(0)
-        return MeasuredPath(rate_hz, self._commanded[:n], self._measured[:n], self._loads[:n], seconds)
+
+        def tools(rows: FloatArray) -> FloatArray:
+            points = [[arm.kinematics.tool_pose(row[i, :-1])[:3, 3] for i, arm in enumerate(arms)] for row in rows]
+            return np.array(points).reshape(n, len(arms), 3)
+
+        return MeasuredPath(
+            rate_hz, commanded, measured, tools(commanded), tools(np.nan_to_num(measured)), self._loads[:n], seconds
+        )
 
 
 def _between(motion: Motion, position: float, offset: FloatArray) -> list[Command]:

@@ -61,9 +61,9 @@ class Cell(Protocol):
     """A gymnasium environment that holds a scene with A arms; see the methods of the same names in `Task`.
 
     ``advance`` takes one control step towards ``command (A·(J + 1),)``: for each arm the joint angles and the finger
-    travel, rad and m; ``measured`` returns the same quantities, ``grip_loads (A,)`` the grippers' shares of their force.
-    ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is
-    not done, empty if it is done. ``layout`` has the draws of the scene.
+    travel, rad and m; ``measured`` returns the same quantities, ``grip_loads (A,)`` each gripper's share of its force
+    limit. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is not done,
+    empty if it is done. ``layout`` has the draws of the scene.
     """
 
     layout: Layout

@@ -61,14 +61,18 @@ class Emulation:
 def emulated(config: CellConfig) -> Iterator[Emulation]:
     """Run an emulated cell in a process of its own while the context lasts."""
     command = [sys.executable, "-m", "robust_instant_policy.cli", "robot", "emulate", "--robot", str(config.path)]
-    process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-    )
-    assert process.stdin is not None and process.stdout is not None and process.stderr is not None
-    try:
+    with (
+        tempfile.TemporaryFile() as errors,
+        subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, start_new_session=True
+        ) as process,
+    ):
+        assert process.stdin is not None
+        assert process.stdout is not None
         line = process.stdout.readline()
         if not line:
-            words = process.stderr.read().decode(errors="replace").strip().splitlines()
+            errors.seek(0)
+            words = errors.read().decode(errors="replace").strip().splitlines()
             raise RobotError(f"the emulated cell does not start: {words[-1] if words else 'it ended at once'}")
         started = json.loads(line)
         arms = tuple(
@@ -76,16 +80,14 @@ def emulated(config: CellConfig) -> Iterator[Emulation]:
             for arm in config.arms
         )
         camera = DeviceConfig("emulated", MappingProxyType({"url": started["url"]}), f"{config.path}: camera")
-        yield Emulation(started["url"], process.pid, replace(config, arms=arms, camera=camera))
-    finally:
-        process.stdin.close()
         try:
-            process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        process.stdout.close()
-        process.stderr.close()
+            yield Emulation(started["url"], process.pid, replace(config, arms=arms, camera=camera))
+        finally:
+            process.stdin.close()  # it ends then
+            try:
+                process.wait(5.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
 
 class EmulatedCamera:
