@@ -102,8 +102,8 @@ def tool_frame(first: FloatArray, second: FloatArray) -> tuple[FloatArray, float
 
 @dataclass(frozen=True, eq=False)
 class ToolCalibration:
-    """``tool (4, 4)`` measured tool -> that of the arm's model, ``length`` and ``opening`` in metres, ``left_out_mm`` the error at each touch,
-    ``closed_travel`` and ``open_travel`` of each finger as the gripper reads them, metres."""
+    """``tool (4, 4)`` measured tool -> that of the arm's model, ``length`` and ``opening`` in metres, ``left_out_mm``
+    the error at each touch, ``closed_travel`` and ``open_travel`` of each finger as the gripper reads them, metres."""
 
     arm: str
     tool: FloatArray
