@@ -22,6 +22,7 @@ from robust_instant_policy.robots.station import Station
 from robust_instant_policy.trajectory import Trajectory
 
 APPROACH_RAD_S = 0.5  # at which a follower comes to its leader before both are coupled
+WAIT_S = 1.5  # without progress, until the person is told
 COUPLED_RAD = 0.05  # of each joint between leader and follower, from which they are coupled
 TRIGGER_CLOSES, TRIGGER_OPENS = 0.4, 0.6  # opening of the trigger; between them the gripper keeps its state
 STILL_M = 0.003  # by which gripper points move at most while nothing is shown
@@ -42,8 +43,11 @@ class Following:
     def __init__(self, station: Station, leaders: Sequence[Leader | None], operator: Operator, coupled: str):
         self._station, self._leaders, self._operator, self._words = station, leaders, operator, coupled
         self._travels = [arm.finger_travel for arm in station.arms]
-        self._coupled = False
+        self._coupled, self._waited, self._gap = False, 0, np.inf
         self.key = ""
+        for leader in leaders:
+            if leader is not None:
+                leader.start()
 
     def __call__(self, states: Sequence[ArmState]) -> list[Command] | None:
         self.key = self._operator.pressed(ENTER + DISCARD + QUIT)[:1]
@@ -77,9 +81,14 @@ class Following:
         """A small step of each follower towards its leader, grippers as they are."""
         most = APPROACH_RAD_S / self._station.rate_hz
         gaps = [want.joints - told.joints for told, want in zip(last, wanted, strict=True)]
-        if max(float(np.abs(gap).max()) for gap in gaps) < COUPLED_RAD:
+        gap = max(float(np.abs(one).max()) for one in gaps)
+        if gap < COUPLED_RAD:
             self._coupled = True
             self._operator.say(self._words)
+        self._waited = self._waited + 1 if gap > self._gap - 1e-4 else 0
+        self._gap = gap
+        if self._waited == round(WAIT_S * self._station.rate_hz):
+            self._operator.say("the follower cannot come nearer within its limits: move the leader towards its pose")
         pairs = zip(last, gaps, strict=True)
         return [Command(told.joints + np.clip(gap, -most, most), told.finger_travel) for told, gap in pairs]
 

@@ -31,8 +31,8 @@ class JointSource(Protocol):
 class ArmLeader:
     """See `robots.leader.Leader`; ``finger_travel`` is the follower's, metres.
 
-    Servos count turns from where they are switched on. So whole turns are chosen at the first reading, as near as
-    possible to the follower's joints, and followed from there.
+    Servos count turns from where they are switched on. So whole turns are chosen at the first reading after `start`,
+    as near as possible to the follower's joints, and followed from there.
     """
 
     def __init__(self, source: JointSource, joints: JointMap, finger_travel: float):
@@ -40,8 +40,10 @@ class ArmLeader:
         self._last: FloatArray | None = None
 
     def connect(self) -> None:
-        self._last = None
         self._source.connect()
+
+    def start(self) -> None:
+        self._last = None
 
     def read(self, follower: ArmState) -> Command:
         readings = self._source.angles()

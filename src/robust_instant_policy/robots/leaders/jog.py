@@ -39,8 +39,10 @@ class JogLeader:
         self._told: Command | None = None
 
     def connect(self) -> None:
-        self._told = None
         self._source.connect()
+
+    def start(self) -> None:
+        self._told = None
 
     def read(self, follower: ArmState) -> Command:
         arm = self._arm
