@@ -16,7 +16,7 @@ from robust_instant_policy.errors import DatasetError, StoppedError
 from robust_instant_policy.files import read_regular, write_whole
 from robust_instant_policy.robots.camera import Camera
 from robust_instant_policy.robots.cell import CellConfig
-from robust_instant_policy.robots.execution import observe, park
+from robust_instant_policy.robots.execution import is_parked, observe, park
 from robust_instant_policy.robots.journal import Episode, Journal
 from robust_instant_policy.robots.leader import Leader
 from robust_instant_policy.robots.operator import ENTER, Operator
@@ -141,6 +141,8 @@ class Session:
         self._store(episode, journal, None)
 
     def _park(self) -> None:
+        if is_parked(self.station):
+            return
         played = park(self.station, self.operator.stop, self.station.config.first_run_speed)
         if played.stopped:
             raise StoppedError(f"{played.stopped}; the arms hold their position")
