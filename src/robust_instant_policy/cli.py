@@ -19,6 +19,7 @@ COMMANDS = {
     "record": "record demonstrations into a dataset folder",
     "check": "check demonstrations, and a new scene, against each other, and name likely mistakes",
     "plan": "plan for one observation and write plan.json; nothing is executed",
+    "serve": "plan for robots that ask over openpi's websocket protocol or HTTP",
     "eval": "run the paper's evaluation, or a part of it; continues an interrupted run",
     "train": "train dp or kat-dp on demonstrations; continues an interrupted training",
     "report": "write the report of a run, or of an evaluation, again",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from robust_instant_policy.errors import CellError
 from robust_instant_policy.motion.state import Command
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.check import check_cell
+from robust_instant_policy.robots.emulation.client import devices_of
 from robust_instant_policy.robots.emulation.server import serve
 from robust_instant_policy.robots.emulation.twin import LaggingTwin, Twin, TwinState
 from robust_instant_policy.robots.models import arm_of
@@ -36,7 +38,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _check(config: CellConfig) -> int:
-    return check_cell(config, print)
+    with devices_of(config) as (config, _):
+        return check_cell(config, print)
 
 
 def _emulate(config: CellConfig) -> int:
@@ -53,13 +56,15 @@ def _twin(config: CellConfig) -> Twin:
     if not name:
         arms = [arm_of(arm, config.path.parent) for arm in config.arms]
         return LaggingTwin([arm.home for arm in arms], [arm.finger_travel for arm in arms])
-    return TaskTwin(make_task(name), seed, len(config.arms))
+    return TaskTwin(name, seed, len(config.arms))
 
 
 class TaskTwin:
-    """A scene of a simulated task as the physics of emulated arms."""
+    """The scene ``seed`` of a simulated task as the physics of emulated arms."""
 
-    def __init__(self, task: Any, seed: int, num_arms: int):
+    def __init__(self, name: str, seed: int, num_arms: int):
+        self._renderer = ThreadPoolExecutor(1)  # an OpenGL context belongs to the thread that made it
+        task: Any = self._renderer.submit(make_task, name).result()
         if len(task.end_effectors) != num_arms:
             raise CellError(
                 f"the task {task.name} has {len(task.end_effectors)} arms ({', '.join(task.end_effectors)}), "
@@ -69,7 +74,7 @@ class TaskTwin:
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
-        self._task.reset(seed)
+        self._renderer.submit(self._task.reset, seed).result()
         self._cell = self._task.cell
 
     def advance(self, commands: Sequence[Command]) -> None:
@@ -81,7 +86,7 @@ class TaskTwin:
         return [TwinState(row[:-1], float(row[-1]), float(load)) for row, load in zip(rows, loads, strict=True)]
 
     def photograph(self) -> Observation:
-        return self._cell.photograph()
+        return self._renderer.submit(self._cell.photograph).result()
 
     def failure(self) -> str:
         return str(self._cell.failure())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +28,7 @@ from robust_instant_policy.reporting.run import (
 )
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
-from robust_instant_policy.robots.emulation.client import Emulation, emulated
+from robust_instant_policy.robots.emulation.client import Emulation, devices_of
 from robust_instant_policy.robots.execution import is_parked, observe, park, require_trust
 from robust_instant_policy.robots.signals import stop_on_signals
 from robust_instant_policy.robots.station import Station
@@ -60,12 +59,7 @@ def run(options: argparse.Namespace) -> int:
     config = CellConfig.load(options.robot)
     out = options.plan or options.out or RUNS / config.name
     out.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        emulation = None
-        if config.emulation is not None:
-            with screen.stage("emulated cell"):
-                emulation = stack.enter_context(emulated(config))
-            config = emulation.config
+    with devices_of(config) as (config, emulation):
         _Run(config, emulation, out, options, screen).run()
     return 0
 

@@ -58,7 +58,7 @@ def check_waypoints(trajectory: Trajectory, arms: Sequence[Arm], limits: Limits)
     turns = Rotation.from_matrix(changes.reshape(-1, 3, 3)).magnitude().reshape(changes.shape[:2])
     steps = np.linalg.norm(np.diff(poses[..., :3, 3], axis=0), axis=-1)
     for index, arm in enumerate(arms):
-        _check_workspace(trajectory.triplets[:, index], arm, limits, None)
+        _check_workspace(trajectory.triplets[:, index, 1:], arm, limits, None)
         for values, limit, what, unit, key, scale in (
             (steps[:, index], limits.step, "moves", "m", "step", 1.0),
             (turns[:, index], limits.turn_per_step, "turns", "degrees", "turn_per_step", math.degrees(1.0)),
@@ -125,7 +125,7 @@ class Space:
         capsules = [shape.at(joints[:, index]) for index, shape in enumerate(self._shapes)]
         for index, (arm, shape, links) in enumerate(zip(self._arms, self._shapes, capsules, strict=True)):
             poses = np.array([arm.kinematics.tool_pose(angles) for angles in joints[:, index]])
-            points = arm.triangle.triplets(poses)
+            points = arm.triangle.triplets(poses)[:, 1:]
             _check_workspace(points, arm, limits, rate_hz)
             depth = -points[..., 2].min(axis=-1)
             what = "a fingertip goes"
@@ -236,19 +236,19 @@ def _slowdown(motion: Motion, arms: Sequence[Arm], rate_hz: float) -> tuple[floa
     return worst, reason
 
 
-def _check_workspace(points: FloatArray, arm: Arm, limits: Limits, rate_hz: float | None) -> None:
-    """Refuse tool ``points (N, 3, 3)`` outside the workspace, but on the way from and to the arm's home."""
+def _check_workspace(fingertips: FloatArray, arm: Arm, limits: Limits, rate_hz: float | None) -> None:
+    """Refuse ``fingertips (N, 2, 3)`` outside the workspace, but on the way from and to the arm's home."""
     low, high = limits.workspace[0].copy(), limits.workspace[1]
     low[2] = min(low[2], -limits.table_depth)  # the table has a limit of its own
-    home = arm.triangle.triplets(arm.home_pose)
-    outside = np.maximum(low - points, points - high).max(axis=(1, 2))
+    home = arm.triangle.triplets(arm.home_pose)[1:]
+    outside = np.maximum(low - fingertips, fingertips - high).max(axis=(1, 2))
     beyond = np.maximum(
-        np.minimum(low, home.min(axis=0)) - HOME_MARGIN_M - points,
-        points - np.maximum(high, home.max(axis=0)) - HOME_MARGIN_M,
+        np.minimum(low, home.min(axis=0)) - HOME_MARGIN_M - fingertips,
+        fingertips - np.maximum(high, home.max(axis=0)) - HOME_MARGIN_M,
     ).max(axis=(1, 2))
     inside = np.flatnonzero(outside <= ROUNDING_M)
-    first, last = (inside[0], inside[-1]) if len(inside) else (0, len(points) - 1)
-    excess = np.where((np.arange(len(points)) > first) & (np.arange(len(points)) < last), outside, beyond)
+    first, last = (inside[0], inside[-1]) if len(inside) else (0, len(fingertips) - 1)
+    excess = np.where((np.arange(len(outside)) > first) & (np.arange(len(outside)) < last), outside, beyond)
     if excess.max() > ROUNDING_M:
         step = int(np.argmax(excess))
         what = "its tool is outside the workspace by"

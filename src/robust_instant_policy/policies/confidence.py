@@ -41,6 +41,7 @@ GOOD_PRECISION_M = 0.025
 LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one scene
 NOISE_M = 0.02  # variation of a coordinate below which it says nothing about a scene
 RIGID_M = 0.010  # variation of the distance of two keypoints below which they belong to one rigid thing
+NEAREST = 3  # keypoints with which each is compared where nothing is rigid
 DISTANCE_M = 0.003  # with which a distance between keypoints is measured
 RECORDING = {"gripper state", "grasp", "rotation"}  # kinds of findings
 MIN_SCENES = 3  # below which nothing is known of their variation
@@ -151,27 +152,34 @@ def _squared_distance(rows: FloatArray, row: FloatArray) -> float:
 def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
     """How far distances between keypoints of one thing differ from the demonstrations', of the worst thing.
 
-    A thing is a set of keypoints joined by distances that the demonstrations preserve. For each: the upper quartile of
-    the differences from the median distances, over their variation, and over the demonstrations' own quartile; above 1
-    they differ by more than usual. ``demonstrated (I, K, 3)`` and ``keypoints (K, 3)`` in metres; NaN for fewer than
-    `MIN_SCENES`, or where no distance is preserved.
+    A keypoint is compared with its `NEAREST` keypoints, those to which its distance varies least, and with all to which
+    it is preserved (`RIGID_M`); a thing is what the first of them and the preserved distances join. For each thing: the
+    upper quartile of the differences from the median distances, over their variation, and over the demonstrations' own
+    quartile; above 1 they differ by more than usual. ``demonstrated (I, K, 3)`` and ``keypoints (K, 3)`` in metres; NaN
+    for fewer than `MIN_SCENES`, or for a single keypoint.
     """
-    if len(demonstrated) < MIN_SCENES:
+    count = len(keypoints)
+    if len(demonstrated) < MIN_SCENES or count < 2:
         return float("nan")
-    pairs = np.triu_indices(len(keypoints), 1)
+    pairs = np.triu_indices(count, 1)
     shown, new = (np.linalg.norm((p[..., :, None, :] - p[..., None, :, :]), axis=-1) for p in (demonstrated, keypoints))
-    shown, new = shown[:, *pairs], new[pairs]
-    variation = robust_std(shown)
-    rigid = variation < RIGID_M
-    _, thing = connected_components(coo_array((rigid, pairs), shape=(len(keypoints),) * 2), directed=False)
+    variation = robust_std(shown) + np.diag(np.full(count, np.inf))
+    nearest = np.argsort(variation, axis=1)[:, : min(NEAREST, count - 1)]
+    compared, joined = variation < RIGID_M, variation < RIGID_M
+    compared[np.arange(count)[:, None], nearest] = True
+    joined[np.arange(count), nearest[:, 0]] = True
+    _, thing = connected_components(coo_array(joined), directed=False)
+    compared = (compared | compared.T)[pairs]
+    shown, new, first, second = (
+        shown[:, *pairs][:, compared],
+        new[pairs][compared],
+        *(thing[i][compared] for i in pairs),
+    )
 
     def quartiles(distances: FloatArray, others: FloatArray) -> FloatArray:
         off = np.abs(distances - np.median(others, axis=0)) / np.maximum(robust_std(others), DISTANCE_M)
-        return np.array([np.quantile(off[rigid & (thing[pairs[0]] == one)], 0.75) for one in things])
+        return np.array([np.quantile(off[(first == one) | (second == one)], 0.75) for one in range(thing.max() + 1)])
 
-    things = np.unique(thing[pairs[0]][rigid])
-    if not len(things):
-        return float("nan")
     usual = np.median([quartiles(row, np.delete(shown, index, axis=0)) for index, row in enumerate(shown)], axis=0)
     return float((quartiles(new, shown) / np.maximum(usual, 1.0)).max())
 

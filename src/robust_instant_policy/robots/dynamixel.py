@@ -23,8 +23,8 @@ try:
 except ModuleNotFoundError as error:
     raise MissingExtraError(error.name or "dynamixel-sdk", "robots") from error
 
-TIMEOUT_MS = 40.0  # of a transaction; a USB adapter with a latency timer of 16 ms needs up to 34
-RETRY_MS = 45.0  # since the first try: the last one still ends within 100 ms
+TIMEOUT_MS = 30.0  # of a transaction; a USB adapter with its latency timer of 16 ms needs about 20
+RETRY_TIMEOUTS = 2.1  # after so many of them no new try begins: the last one ends within 100 ms
 TURN = 4096  # position units in one turn
 ZERO = 2048  # position of angle 0
 VELOCITY_UNIT = 0.229 * 2 * math.pi / 60  # rad/s
@@ -76,14 +76,15 @@ HARDWARE_ERRORS = {
 
 
 class Bus:
-    """A serial bus; all methods raise `RobotError` when a servo does not answer within 100 ms.
+    """A serial bus; all methods raise `RobotError` when a servo does not answer within three timeouts.
 
     ``names`` of the servos' IDs appear in messages.
     """
 
-    def __init__(self, port: str, baud: int, names: Mapping[int, str]):
+    def __init__(self, port: str, baud: int, names: Mapping[int, str], timeout_ms: float = TIMEOUT_MS):
         self.port, self._baud, self._names = port, baud, dict(names)
-        self._port = _MonotonicPort(port)
+        self._port, self._timeout_ms = _MonotonicPort(port), timeout_ms
+        self._port.timeout_ms = timeout_ms
         self._packets = sdk.PacketHandler(2.0)
 
     def open(self) -> None:
@@ -173,7 +174,7 @@ class Bus:
             value, result, servo = self._call(transaction)
             if result == sdk.COMM_SUCCESS:
                 return value
-            if (time.monotonic() - start) * 1e3 > RETRY_MS:
+            if (time.monotonic() - start) * 1e3 > RETRY_TIMEOUTS * self._timeout_ms:
                 damaged = result == sdk.COMM_RX_CORRUPT
                 what = "answers with damaged packets" if damaged else "does not answer"
                 name = self._name(servo)
@@ -199,11 +200,13 @@ class Bus:
 class _MonotonicPort(sdk.PortHandler):
     """The SDK's port with timeouts that a change of the system's clock does not touch."""
 
+    timeout_ms = TIMEOUT_MS
+
     def getCurrentTime(self) -> float:
         return time.monotonic() * 1e3
 
     def setPacketTimeout(self, packet_length: int) -> None:
-        self.setPacketTimeoutMillis(TIMEOUT_MS)
+        self.setPacketTimeoutMillis(self.timeout_ms)
 
 
 def to_angle(position: np.ndarray) -> FloatArray:

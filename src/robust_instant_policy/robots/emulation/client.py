@@ -62,6 +62,19 @@ class Emulation:
 
 
 @contextmanager
+def devices_of(config: CellConfig) -> Iterator[tuple[CellConfig, Emulation | None]]:
+    """The cell with the addresses of its devices: its own, or those of an emulation that runs while the context lasts.
+
+    Every command that opens a cell's devices goes through here, so that all can be rehearsed.
+    """
+    if config.emulation is None:
+        yield config, None
+        return
+    with emulated(config) as emulation:
+        yield emulation.config, emulation
+
+
+@contextmanager
 def emulated(config: CellConfig) -> Iterator[Emulation]:
     """Run an emulated cell in a process of its own while the context lasts."""
     command = [sys.executable, "-m", "robust_instant_policy.cli", "robot", "emulate", "--robot", str(config.path)]

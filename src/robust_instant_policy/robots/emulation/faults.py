@@ -10,7 +10,7 @@ from robust_instant_policy.errors import UnknownNameError
 FAULTS = {
     "unplugged": "the cable is pulled out",
     "silent": "the device answers nothing",
-    "garbled": "one answer in forty has a wrong byte",
+    "garbled": "one answer in 200 has a wrong byte",
     "frozen": "the device repeats its last state",
     "overload": "the device reports an overload and stops",
     "protective-stop": "the safety system stops the arm",
@@ -19,7 +19,7 @@ FAULTS = {
 }
 
 
-GARBLED_SHARE = 1 / 40
+GARBLED_SHARE = 1 / 200
 
 
 class FaultSwitch:

@@ -33,7 +33,9 @@ PING, READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x0
 BROADCAST = 0xFE
 RANGE_ERROR, ACCESS_ERROR = 0x04, 0x07
 LOCKED_BELOW = 64  # registers of the EEPROM, which cannot be written with the torque on
-WATCHDOG_UNIT_S, WATCHDOG_EXPIRED = 0.020, 0xFF
+# The emulation shares the processor with what uses it: timeouts are ten times those of real servos.
+EMULATED_TIMEOUT_MS, WATCHDOG_UNIT_S = 300.0, 0.20
+WATCHDOG_EXPIRED = 0xFF
 OVERLOAD = 0x20
 
 
@@ -62,8 +64,8 @@ class ServoBus:
         threading.Thread(target=self._serve, daemon=True).start()
 
     @property
-    def options(self) -> dict[str, str]:
-        return {"port": os.ttyname(self._slave)}
+    def options(self) -> dict[str, str | float]:
+        return {"port": os.ttyname(self._slave), "timeout_ms": EMULATED_TIMEOUT_MS}
 
     def unplug(self) -> None:
         """Pull the cable: the port is gone."""
@@ -142,6 +144,8 @@ class ServoBus:
         if address == dxl.TORQUE.address and self._get(servo, dxl.HARDWARE_ERROR):
             return ACCESS_ERROR
         if address == dxl.GOAL_POSITION.address and self._get(servo, dxl.BUS_WATCHDOG) == WATCHDOG_EXPIRED:
+            return RANGE_ERROR
+        if address == dxl.GOAL_POSITION.address and not 0 <= int.from_bytes(data, "little", signed=True) < dxl.TURN:
             return RANGE_ERROR
         self.limp |= address == dxl.TORQUE.address and torque == 1 and data[0] == 0
         for one in (

@@ -33,14 +33,20 @@ GRIPPER_CURRENT = 200  # of the goal current, units of 2.69 mA: about the 25 N w
 WATCHDOG = 5  # units of 20 ms: servos that hear nothing for 100 ms stop where they are
 ERROR_EVERY = 5  # states between two readings of the hardware error registers
 BAUD = 1_000_000
+HELD_BACK_RAD = 0.1, 0.6  # between goal and position of an arm in whose way something is; more is a wrong reading
 
 
 def make(arm: Arm, section: Section, rate_hz: float) -> ViperX:
-    """Options: ``port``, ``baud``, ``gripper_current``, ``gripper_open`` and ``gripper_closed`` in rad."""
-    return ViperX(
-        arm.name,
+    """Options: ``port``, ``baud``, ``timeout_ms``, ``gripper_current``, ``gripper_open``, ``gripper_closed`` (rad)."""
+    bus = dxl.Bus(
         section.text("port"),
         section.whole("baud", BAUD, least=1),
+        SERVOS,
+        section.number("timeout_ms", dxl.TIMEOUT_MS, 1.0, 1e4),
+    )
+    return ViperX(
+        arm.name,
+        bus,
         arm.finger_travel,
         section.whole("gripper_current", GRIPPER_CURRENT, least=1),
         section.number("gripper_closed", GRIPPER_CLOSED_RAD, -np.pi, np.pi),
@@ -52,9 +58,9 @@ class ViperX:
     """See `robots.follower.Follower`."""
 
     def __init__(
-        self, name: str, port: str, baud: int, finger_travel: float, gripper_current: int, closed: float, opened: float
+        self, name: str, bus: dxl.Bus, finger_travel: float, gripper_current: int, closed: float, opened: float
     ):
-        self.name, self._bus = name, dxl.Bus(port, baud, SERVOS)
+        self.name, self._bus = name, bus
         self._travel, self._current, self._closed, self._open = finger_travel, gripper_current, closed, opened
         self._readings, self._clock = 0, 0.0
         self._faults: tuple[str, ...] = ()
@@ -95,11 +101,14 @@ class ViperX:
         self._bus.sync_write(ALL, dxl.GOAL_POSITION, self._goal(command.joints, command.finger_travel))
 
     def stop(self) -> None:
-        # The servos hold their last goal. The present position becomes the goal: they must not go on to the old one.
+        # The servos hold their last goal, one step ahead of where they are. Where something holds an arm back, its
+        # present position becomes the goal, so that it does not push on; a frozen or impossible reading is not used.
         with contextlib.suppress(RobotError):
             self._unwatch()
-            positions = self._bus.sync_read(JOINTS, dxl.PRESENT_POSITION)[:, 0]
-            self._bus.sync_write(JOINTS, dxl.GOAL_POSITION, positions.tolist())
+            goals, ticks, positions = self._bus.sync_read(JOINTS, dxl.GOAL_POSITION, dxl.TICK, dxl.PRESENT_POSITION).T
+            away = np.abs(positions - goals).max() * 2 * np.pi / dxl.TURN
+            if ticks[0] != self._tick and HELD_BACK_RAD[0] < away < HELD_BACK_RAD[1]:
+                self._bus.sync_write(JOINTS, dxl.GOAL_POSITION, positions.tolist())
 
     def disconnect(self) -> None:
         self.stop()
