@@ -128,7 +128,9 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
     arm = Station(config).arms[0]
     ours, theirs = multiprocessing.get_context("spawn").Pipe()
     rest = np.append(arm.home, arm.finger_travel)
-    leading = multiprocessing.get_context("spawn").Process(target=lead, args=(rest, arm.finger_travel, theirs))
+    leading = multiprocessing.get_context("spawn").Process(
+        target=lead, args=(rest, arm.finger_travel, theirs), daemon=True
+    )
     leading.start()
     with emulated(config) as emulation:
         port = DeviceConfig("aloha", MappingProxyType(ours.recv()), "leader")

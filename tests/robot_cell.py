@@ -30,8 +30,8 @@ name = "left"
 model = "viperx-300"
 base = [-0.469, 0, 0, 0, 0, 0]
 park = {park}
-driver = {{ kind = "viperx", port = "{follower}" }}
-leader = {{ kind = "aloha", port = "{leader}" }}
+driver = {{ kind = "viperx", port = "{follower}", timeout_ms = 300 }}
+leader = {{ kind = "aloha", port = "{leader}", timeout_ms = 300 }}
 
 [camera]
 kind = "folder"

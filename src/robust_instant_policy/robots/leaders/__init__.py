@@ -62,7 +62,8 @@ def joint_source(config: ArmConfig) -> JointSource:
         usual = servos.ALOHA_SERVOS if kind == "aloha" else servos.GELLO_SERVOS
         baud = section.whole("baud", 1_000_000 if kind == "aloha" else 57_600, least=1)
         numbers = section.array("servos", (None,), usual).astype(int).tolist()
-        source = servos.DynamixelSource(name, section.text("port"), baud, numbers)
+        timeout_ms = section.number("timeout_ms", servos.TIMEOUT_MS, 1.0, 1e4)
+        source = servos.DynamixelSource(name, section.text("port"), baud, numbers, timeout_ms)
     section.finish()
     return source
 

@@ -9,6 +9,7 @@ import numpy as np
 from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.robots import dynamixel as dxl
+from robust_instant_policy.robots.dynamixel import TIMEOUT_MS
 from robust_instant_policy.robots.leaders.joint_map import JointMap
 
 # ALOHA's leader, a WidowX 250: as its follower, joint by joint; the second servos of shoulder and elbow are not read.
@@ -20,9 +21,10 @@ GELLO_SERVOS = (1, 2, 3, 4, 5, 6, 7)
 class DynamixelSource:
     """See `JointSource`; the ``servos`` in the order of the channels."""
 
-    def __init__(self, name: str, port: str, baud: int, servos: Sequence[int]):
+    def __init__(self, name: str, port: str, baud: int, servos: Sequence[int], timeout_ms: float = TIMEOUT_MS):
         self.name, self._servos = name, tuple(servos)
-        self._bus = dxl.Bus(port, baud, {servo: f"{name}, channel {index}" for index, servo in enumerate(servos)})
+        names = {servo: f"{name}, channel {index}" for index, servo in enumerate(servos)}
+        self._bus = dxl.Bus(port, baud, names, timeout_ms)
 
     def connect(self) -> None:
         self._bus.open()
