@@ -61,8 +61,9 @@ class Cell(Protocol):
     """A gymnasium environment that holds a scene with A arms; see the methods of the same names in `Task`.
 
     ``advance`` takes one control step towards ``command (A·(J + 1),)``: for each arm the joint angles and the finger
-    travel, rad and m. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is
-    not done, empty if it is done. ``layout`` has the draws of the scene.
+    travel, rad and m; ``measured`` returns the same quantities, ``grip_loads (A,)`` each gripper's share of its force
+    limit. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is not done,
+    empty if it is done. ``layout`` has the draws of the scene.
     """
 
     layout: Layout
@@ -71,6 +72,8 @@ class Cell(Protocol):
     def photograph(self) -> Observation: ...
     def scene_truth(self) -> SceneTruth: ...
     def advance(self, command: FloatArray) -> None: ...
+    def measured(self) -> FloatArray: ...
+    def grip_loads(self) -> FloatArray: ...
     def tool_poses(self) -> FloatArray: ...
     def video_frame(self) -> np.ndarray: ...
     def failure(self) -> str: ...
@@ -178,6 +181,11 @@ class SimulatedTask:
         trajectory = Trajectory.from_poses(poses[recorded], closed[recorded], self._triangle)
         demonstration = Demonstration(observation, trajectory, self.record_hz / every, self.name, seed)
         return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
+
+    @property
+    def cell(self) -> Cell:
+        """The environment, as physics of an emulated robot."""
+        return self._cell
 
     def scene_truth(self) -> SceneTruth:
         """Ground truth of the camera's pixels, to measure perception; not for policies."""
