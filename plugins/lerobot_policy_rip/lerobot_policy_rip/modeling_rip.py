@@ -59,7 +59,10 @@ class RipPolicy(PreTrainedPolicy):
         """The next action ``(B, D)``."""
         if self._chunk is None:
             self._chunk = self.predict_action_chunk(batch)
-        action = self._chunk[:, min(self._step, self._chunk.shape[1] - 1)]
+        last = self._chunk.shape[1] - 1
+        action = self._chunk[:, min(self._step, last)]
+        if self._step == last:
+            logger.info("the motion has ended, the robot holds its position")
         self._step += 1
         return action
 
