@@ -51,7 +51,7 @@ REST_S = 0.4  # of the hand, after it has shown a demonstration
 CELL = """
 [cell]
 name = "end-to-end"
-workspace = [[-0.30, -0.32, -0.005], [0.22, 0.32, 0.40]]
+workspace = [[-0.40, -0.40, -0.005], [0.30, 0.40, 0.50]]
 min_confidence = 0.0
 
 [[arms]]
