@@ -5,8 +5,8 @@
 
 A scripted hand moves the leader as the task's demonstrator moves: the leader's servos are on an emulated bus in a
 process of its own, as the follower's are. Both are read and written by the real drivers, at 50 Hz. Without ``--llm``
-the plans are those of the nearest demonstrations (`neighbours`), which `rip run --plan` executes. The plans are executed
-by the simulator, too, in the same scenes. An interrupted run continues.
+the plans are those of the nearest demonstrations (`neighbours`), which `rip run --plan` executes. The simulator
+executes the plans, too, in the same scenes. An interrupted run continues.
 """
 
 from __future__ import annotations
