@@ -32,7 +32,7 @@ TYPES = {
         "timestamp", "speed_scaling", "target_speed_fraction", "actual_momentum", "actual_main_voltage",
         "actual_robot_voltage", "actual_robot_current", "payload", "tool_output_current", "tool_temperature",
         "standard_analog", "actual_execution_time", "tcp_force_scalar", "ft_raw_wrench_scalar", "io_current",
-        "euromap67", "tool_analog", "output_double", "input_double", "speed_slider_fraction", "external_force_torque_scalar",
+        "euromap67", "tool_analog", "output_double", "input_double", "speed_slider_fraction",
     ),
     "UINT64": ("actual_digital", "actual_configurable_digital"),
     "INT32": ("robot_mode", "safety_mode", "safety_status", "tool_output_voltage", "output_int", "input_int"),
