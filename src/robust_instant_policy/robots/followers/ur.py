@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import socket
 import sys
+import threading
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -32,6 +34,7 @@ WATCHDOG_HZ = 10.0  # the controller stops the script when targets arrive more r
 LOOKAHEAD_S, GAIN = 0.1, 300.0  # of servoJ, the maker's defaults
 STOP_DECELERATION = 2.0  # rad/s², of stopJ
 SCRIPT_SECONDS = 5.0  # for the script to start
+STOP_SECONDS, DISCONNECT_SECONDS = 0.5, 2.0  # that the library may take
 GRIPPER_PORT, GRIPPER_TIMEOUT_S = 63352, 0.09
 GRIPPER_FORCE = 100  # of 255
 RUNNING_MODE = 7
@@ -92,7 +95,7 @@ class UR:
             finger_travel=travel,
             grip_load=load,
             clock=receive.getTimestamp(),
-            faults=tuple(words for bit, words in SAFETY_BITS.items() if bits >> bit & 1),
+            faults=_faults(bits),
         )
 
     def command(self, command: Command) -> None:
@@ -100,8 +103,9 @@ class UR:
         if not self._serving:
             self._start(control)
         if not control.servoJ(command.joints.tolist(), 0.0, 0.0, self._step, LOOKAHEAD_S, GAIN):
+            faults = "; ".join(_faults(self._require(self._receive).getSafetyStatusBits()))
             raise RobotError(
-                f"{self.name}: the controller no longer takes targets; see the teach pendant, then run again"
+                f"{self.name}: the controller no longer takes targets: {faults or 'see the teach pendant'}"
             )
         self._gripper.command(command.finger_travel)
 
@@ -109,17 +113,18 @@ class UR:
         if self._control is None or not self._serving:
             return
         self._serving = False
-        # Ending the script ends its watchdog, too; the controller holds the arm.
-        with contextlib.suppress(RuntimeError):
-            self._control.servoStop()
-            self._control.stopJ(STOP_DECELERATION)
-            self._control.stopScript()
+        # Ending the script ends its watchdog, too; the controller holds the arm. Over a dead connection nothing ends,
+        # and the watchdog stops the script.
+        control = self._control
+        for call in (control.servoStop, lambda: control.stopJ(STOP_DECELERATION), control.stopScript):
+            if not _bounded(call, STOP_SECONDS):
+                return
 
     def disconnect(self) -> None:
         self.stop()
         for interface in (self._control, self._receive):
             if interface is not None:
-                interface.disconnect()
+                _bounded(interface.disconnect, DISCONNECT_SECONDS)
         self._control = self._receive = None
         self._gripper.disconnect()
 
@@ -156,6 +161,23 @@ class UR:
         if interface is None:
             raise RobotError(f"{self.name} is not connected")
         return interface
+
+
+def _faults(bits: int) -> tuple[str, ...]:
+    return tuple(words for bit, words in SAFETY_BITS.items() if bits >> bit & 1)
+
+
+def _bounded(call: Callable[[], object], seconds: float) -> bool:
+    """Whether ``call`` came back in time; the library may wait for minutes on a connection that is dead."""
+
+    def run() -> None:
+        with contextlib.suppress(RuntimeError):
+            call()
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    return not thread.is_alive()
 
 
 class RobotiqGripper:
