@@ -70,8 +70,12 @@ class TaskTwin:
                 f"the task {task.name} has {len(task.end_effectors)} arms ({', '.join(task.end_effectors)}), "
                 f"the cell's file {num_arms}"
             )
-        self._renderer.submit(task.reset, seed).result()
-        self._cell = task.cell
+        self._task = task
+        self.reset(seed)
+
+    def reset(self, seed: int) -> None:
+        self._renderer.submit(self._task.reset, seed).result()
+        self._cell = self._task.cell
 
     def advance(self, commands: Sequence[Command]) -> None:
         self._cell.advance(np.concatenate([np.append(one.joints, one.finger_travel) for one in commands]))

@@ -138,7 +138,8 @@ class ArmConfig:
     """An arm of the cell.
 
     ``model`` is a known one or the path of a URDF; ``base (4, 4)`` its pose in the world; ``park (J,)`` the joint
-    angles, rad, out of the camera's sight, where a run begins; ``gripper`` None for that of the model;
+    angles, rad, out of the camera's sight, where a run begins; ``gripper`` None for that of the model, ``tool (4, 4)``
+    measured tool -> tool of the model, None where they are the same;
     ``joint_speed`` rad/s, ``joint_acceleration`` rad/s² and ``tool_speed`` m/s narrow the model's limits, None leaves
     them.
     """
@@ -148,6 +149,7 @@ class ArmConfig:
     base: FloatArray
     park: FloatArray
     gripper: GripperTriangle | None
+    tool: FloatArray | None
     driver: DeviceConfig
     leader: DeviceConfig | None
     joint_speed: float | None
@@ -197,6 +199,8 @@ class CellConfig:
         for arm in self.arms:
             gripper = None if arm.gripper is None else [arm.gripper.length, arm.gripper.opening]
             parts.append([arm.name, arm.model, np.round(arm.base, 6).tolist(), gripper])
+            if arm.tool is not None:
+                parts.append(np.round(arm.tool, 6).tolist())
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
     @classmethod
@@ -258,6 +262,12 @@ def read_gripper(path: Path) -> GripperTriangle:
     return _gripper(read_section(path))
 
 
+def read_tool(path: Path) -> FloatArray | None:
+    """``tool (4, 4)`` of a gripper's file, measured tool -> tool of the arm's model; None without it."""
+    section = read_section(path)
+    return section.array("tool", (4, 4)) if "tool" in section else None
+
+
 def _gripper(section: Section) -> GripperTriangle:
     return GripperTriangle(
         section.number("length", least=0.002, most=1.0), section.number("opening", least=0.002, most=0.5)
@@ -281,16 +291,17 @@ def _limits(cell: Section) -> Limits:
 def _arm(section: Section, path: Path) -> ArmConfig:
     name = section.text("name")
     base = section.array("base", (6,), [0.0] * 6)
-    gripper = None
+    gripper = tool = None
     if "gripper" in section:
-        file = section.text("gripper")
-        gripper = read_gripper(path.parent / file)
+        file = path.parent / section.text("gripper")
+        gripper, tool = read_gripper(file), read_tool(file)
     config = ArmConfig(
         name=name,
         model=section.text("model"),
         base=make_pose(Rotation.from_euler("xyz", base[3:], degrees=True).as_matrix(), base[:3]),
         park=section.array("park", (None,)),
         gripper=gripper,
+        tool=tool,
         driver=DeviceConfig.read(section.section("driver"), f"{path}: driver of {name}"),
         leader=DeviceConfig.read(section.section("leader"), f"{path}: leader of {name}")
         if "leader" in section

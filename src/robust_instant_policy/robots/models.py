@@ -10,7 +10,7 @@ import numpy as np
 
 from robust_instant_policy import motion
 from robust_instant_policy.errors import CellError
-from robust_instant_policy.geometry import GripperTriangle
+from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pose
 from robust_instant_policy.motion.arm import Arm
 from robust_instant_policy.motion.kinematics import ORIENTATION_COST, Kinematics
 from robust_instant_policy.robots.cell import ArmConfig
@@ -79,9 +79,11 @@ def arm_of(config: ArmConfig, folder: Path = Path()) -> Arm:
     spec = mujoco.MjSpec.from_file(str(model.urdf))
     spec.compiler.fusestatic = False  # the tool frame is a separate link
     try:
+        if config.tool is not None:
+            _move_tool(spec.body(TOOL), config.tool)
         compiled = spec.compile()
         compiled.body(TOOL)
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, AttributeError) as error:
         raise CellError(f"{model.urdf} cannot be used: {error}; it needs a link called {TOOL}") from None
     revolute = int((compiled.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).sum())
     if len(config.park) != revolute:
@@ -100,3 +102,13 @@ def arm_of(config: ArmConfig, folder: Path = Path()) -> Arm:
         turn_tolerance=model.turn_tolerance,
         joint_acceleration=config.joint_acceleration or model.joint_acceleration,
     )
+
+
+def _move_tool(link: mujoco.MjsBody, tool: FloatArray) -> None:
+    """Correct the tool's link by ``tool (4, 4)``, measured -> model's."""
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, link.quat)
+    pose = make_pose(turn.reshape(3, 3), link.pos) @ tool
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, pose[:3, :3].ravel())
+    link.pos, link.quat = pose[:3, 3], quaternion

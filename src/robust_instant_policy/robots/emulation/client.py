@@ -52,6 +52,10 @@ class Emulation:
         """Names of the arms whose torque was switched off."""
         return list(json.loads(request(f"{self.url}/state"))["limp"])
 
+    def scene(self, seed: int) -> None:
+        """Build the scene with a ``seed``; the arms are at home, as if parked."""
+        request(f"{self.url}/scene/{seed}", b"")
+
     def fault(self, arm: str, fault: str) -> None:
         """Give an arm a fault of `faults.FAULTS`, or none with an empty name."""
         request(f"{self.url}/fault/{arm}/{fault}", b"")

@@ -1,6 +1,7 @@
 """The process of an emulated cell: its devices, and an HTTP address for its camera, its faults and its task.
 
-``GET /observation.npz``, ``/commands.npy`` (what the arms executed), ``/state`` (JSON); ``POST /fault/ARM/FAULT``.
+``GET /observation.npz``, ``/commands.npy`` (what the arms executed), ``/state`` (JSON); ``POST /fault/ARM/FAULT``,
+``/scene/SEED``.
 """
 
 from __future__ import annotations
@@ -90,11 +91,13 @@ def _handler(shared: SharedTwin, devices: Mapping[str, Device]) -> type[BaseHTTP
 
         def do_POST(self) -> None:
             _, what, name, fault = (self.path.split("/") + [""] * 3)[:4]
-            if what != "fault" or name not in devices:
+            if (what != "fault" or name not in devices) and (what != "scene" or not name.isdecimal()):
                 self._send(404, b"not here")
                 return
             try:
-                if fault == "unplugged":
+                if what == "scene":
+                    shared.reset(int(name))
+                elif fault == "unplugged":
                     devices[name].unplug()
                 else:
                     devices[name].fault.set(fault)

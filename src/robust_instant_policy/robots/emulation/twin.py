@@ -34,6 +34,10 @@ class Twin(Protocol):
     def states(self) -> Sequence[TwinState]: ...
     def photograph(self) -> Observation: ...
 
+    def reset(self, seed: int) -> None:
+        """Build the scene with a ``seed``; the arms are at home."""
+        ...
+
     def failure(self) -> str:
         """Reason why the task is not done, empty if it is."""
         ...
@@ -44,6 +48,9 @@ class LaggingTwin:
 
     def __init__(self, homes: Sequence[FloatArray], travels: Sequence[float]):
         self._states = [TwinState(np.array(home), travel, 0.0) for home, travel in zip(homes, travels, strict=True)]
+
+    def reset(self, seed: int) -> None:
+        """There is no scene; the arms stay."""
 
     def advance(self, commands: Sequence[Command]) -> None:
         self._states = [
@@ -87,6 +94,12 @@ class SharedTwin:
             self._waiting.add(arm)
             if len(self._waiting) == len(self._told):
                 self._advance()
+
+    def reset(self, seed: int) -> None:
+        with self._lock:
+            self.twin.reset(seed)
+            self._told = [Command(state.joints, state.finger_travel) for state in self.twin.states()]
+            self._waiting.clear()
 
     def state(self, arm: int) -> TwinState:
         with self._lock:
