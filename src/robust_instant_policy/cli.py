@@ -19,6 +19,7 @@ COMMANDS = {
     "record": "record demonstrations into a dataset folder",
     "check": "check demonstrations, and a new scene, against each other, and name likely mistakes",
     "plan": "plan for one observation and write plan.json; nothing is executed",
+    "serve": "plan for robots that ask over openpi's websocket protocol or HTTP",
     "eval": "run the paper's evaluation, or a part of it; continues an interrupted run",
     "train": "train dp or kat-dp on demonstrations; continues an interrupted training",
     "report": "write the report of a run, or of an evaluation, again",
@@ -26,6 +27,8 @@ COMMANDS = {
     "view": "write a page that shows every demonstration of a folder",
     "keypoints": "write a page with the keypoints of demonstrations and new scenes, and their errors",
     "samples": "count or export the stored answers of a language model",
+    "robot": "check the devices of a real cell, or emulate one",
+    "run": "plan for what the cell's camera sees, and execute the plan on its arms",
     "doctor": "check this machine, and say how to install what is missing",
 }
 

@@ -31,6 +31,7 @@ from robust_instant_policy.motion.limits import (
     Limits,
 )
 
+CELLS = Path(__file__).with_name("cells")  # those that come with the package: emulated ones
 MIN_CONFIDENCE = 0.9  # of a plan; below it `rip run` refuses (docs/trust.md)
 FIRST_RUN_SPEED = 0.25  # share of the usual speed, until a first run in a cell has ended well
 
@@ -177,6 +178,17 @@ class CellConfig:
     camera_calibration: Path | None
     emulation: Mapping[str, Any] | None = field(default=None)
 
+    def emulation_section(self) -> Section:
+        """The table [emulation]; raises `CellError` for a cell with real devices."""
+        if self.emulation is None:
+            raise CellError(f"{self.path} has no table [emulation]: its devices are real")
+        return Section(self.emulation, f"{self.path}: emulation")
+
+    @property
+    def pace(self) -> float:
+        """How much faster than time the cell runs; 1 for real devices."""
+        return 1.0 if self.emulation is None else float(self.emulation.get("pace", 1.0))
+
     @property
     def digest(self) -> str:
         """Digest of the camera's calibration, the grippers and the arms' bases: a plan holds in the cell it was made
@@ -189,8 +201,11 @@ class CellConfig:
 
     @classmethod
     def load(cls, path: str | Path) -> CellConfig:
-        """Read a cell's file. Raises `CellError` in one line that names the key."""
+        """Read a cell's file, or one of those in `CELLS` by its name. Raises `CellError` in one line that names the
+        key."""
         path = Path(path)
+        if not path.exists() and (CELLS / f"{path.name}.toml").exists():
+            path = CELLS / f"{path.name}.toml"
         root = read_section(path)
         cell = root.section("cell")
         arms = tuple(_arm(section, path) for section in root.sections("arms"))
