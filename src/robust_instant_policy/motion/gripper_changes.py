@@ -1,8 +1,8 @@
 """When a gripper opens and closes, from what was recorded of it.
 
-A plan says at which waypoint the state changes, so a recording must say it where the hand nearly stops: at that waypoint
-the execution waits while the fingers travel. A commanded state changes earlier, a finger width passes any threshold at
-another moment; the slowest moment of the hand while the fingers travel is the same in both.
+A plan says at which waypoint the state changes, so a recording must say it where the hand nearly stops: at that
+waypoint the execution waits while the fingers travel. A commanded state changes earlier, a finger width passes any
+threshold at another moment; the slowest moment of the hand while the fingers travel is the same in both.
 
     opening   ‾‾‾‾‾‾‾\\____________          fingers travel from a to b
     speed     ‾‾\\_______/‾‾‾‾‾‾‾            the hand is slowest at c, a <= c <= b
@@ -21,7 +21,7 @@ ENDS = 0.05  # of the travel, at its two ends, that does not count as travelling
 
 
 def state_of_opening(opening: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
-    """Gripper state ``(T,)`` (True: closed) from measured finger ``opening (T,)`` and gripper ``points (T, 3)``, metres.
+    """Gripper state ``(T,)``, True where closed, from finger ``opening (T,)`` and gripper ``points (T, 3)``, metres.
 
     Each change is where the hand is slowest while the fingers travel.
     """

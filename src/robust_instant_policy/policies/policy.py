@@ -122,6 +122,24 @@ class Plan:
     frames: tuple[FrameUse, ...] = ()
     cell: str = ""
 
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Plan:
+        """A plan to follow ``trajectory``, of which nothing else is known."""
+        steps, dim = trajectory.actions.shape
+        return cls(
+            trajectory=trajectory,
+            candidates=(trajectory,),
+            weights=np.ones((1, steps)),
+            scale=np.zeros((steps, dim)),
+            hallucinated=np.zeros(1, dtype=bool),
+            onset=np.full(1, -1),
+            scores=np.zeros(1),
+            confidence=None,
+            keypoints=np.zeros((0, 3)),
+            pixels=np.zeros((0, 2)),
+            keypoint_confidence=np.zeros(0),
+        )
+
     def save(self, path: str | Path) -> None:
         """Write the plan as JSON, whole or not at all. Raises `DatasetError` when that is not possible."""
         content = {
@@ -264,7 +282,8 @@ class Policy(Protocol):
 class ClosedLoopPolicy(Protocol):
     """Sees demonstrations once, then moves the robot in closed loop."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     @property
     def max_seconds(self) -> float:

@@ -7,8 +7,7 @@ from importlib import import_module
 from typing import Any
 
 from robust_instant_policy.errors import MissingExtraError
-from robust_instant_policy.tasks.metaworld.benchmark import NAMES as METAWORLD_NAMES
-from robust_instant_policy.tasks.metaworld.benchmark import PREFIX as METAWORLD
+from robust_instant_policy.tasks.metaworld.benchmark import METAWORLD
 
 
 @dataclass(frozen=True)
@@ -41,5 +40,5 @@ FAMILIES = (
     ),
 )
 BENCHMARKS = (  # tasks of other people's packages, called BENCHMARK/NAME
-    Family("metaworld.task", "metaworld", tuple(f"{METAWORLD}{name}" for name in METAWORLD_NAMES)),
+    Family("metaworld.task", "metaworld", METAWORLD.tasks),
 )

@@ -69,10 +69,10 @@ class MetaWorldTask:
 
     def follow(self, controller: Controller, max_seconds: float, on_frame: FrameSink | None = None) -> Execution:
         self._rebuild(self._last_seed())
-        steps = max(1, round(self.record_hz / controller.rate_hz))
+        steps = max(1, round(self.record_hz / (controller.rate_hz or self.execute_hz)))
         closed, worst = False, 0.0
         while self._env.steps < max_seconds * self.record_hz and not (self._env.over or self._env.success):
-            waypoints = controller.act(self._photograph().rgb, self._action(closed))
+            waypoints = controller.act(self._photograph(), self._action(closed))
             if waypoints is None:
                 break
             trajectory = Trajectory.from_actions(waypoints)
@@ -154,8 +154,8 @@ def _hand_path(
 ) -> Iterator[tuple[FloatArray, bool]]:
     """Fingertip point ``(3,)`` and gripper state at each control step.
 
-    A waypoint is reached in ``steps``, or more where it is far; where the state, at first ``closed``, changes there, the
-    hand waits.
+    A waypoint is reached in ``steps``, or more where it is far; where the state, at first ``closed``, changes there,
+    the hand waits.
     """
     points = trajectory.triplets[:, 0, 1:].mean(axis=1)
     at = hand + FINGERTIPS_M
