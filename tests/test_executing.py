@@ -5,7 +5,7 @@ import pytest
 
 from robust_instant_policy import Demonstration, GripperTriangle, Plan, Trajectory
 from robust_instant_policy.errors import InvalidValueError
-from robust_instant_policy.geometry import make_pose
+from robust_instant_policy.geometry import lift, make_pose
 from robust_instant_policy.motion.gripper_changes import Pace
 from robust_instant_policy.policies import Neighbours
 from robust_instant_policy.tasks.template import PlaceBlock
@@ -48,13 +48,19 @@ def test_poses_stop_where_the_gripper_closes():
 
 
 def test_a_plan_knows_the_pace_of_its_demonstrations_and_keeps_it_in_its_file(tmp_path):
-    class Corners:
+    class Middles:
         def locate(self, observation):
-            return np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], task.places["block"].tolist() + [0.0]])
+            found = []
+            for channel in (0, 2):
+                seen = observation.rgb[..., channel] > observation.rgb.mean(axis=2) + 30
+                pixels, camera = np.argwhere(seen)[:, ::-1], (observation.intrinsics, observation.camera_pose)
+                points = lift(pixels, observation.depth[seen], *camera)
+                found += [points.min(axis=0), points.max(axis=0)]
+            return np.array(found)
 
     task = PlaceBlock()
     shown = []
-    policy = Neighbours(keypoints=Corners())
+    policy = Neighbours(keypoints=Middles())
     for seed in range(4):
         shown.append(task.demonstrate(seed).demonstration)
     plan = policy.fit(shown).plan(shown[-1].observation)
