@@ -2,7 +2,8 @@
 
     python scripts/lerobot_end_to_end.py --lerobot ENV [--work DIR] [--record-only]
 
-ENV comes from `plugins/setup.sh`. The commands run in a terminal in which the key n is pressed when the leader says so.
+ENV comes from `plugins/setup.sh`. The commands run in a terminal in which the key n is pressed when the leader says so,
+and Ctrl-C when the policy says that the motion has ended.
 The recording must hold all episodes, and the policy must do the task. ``--record-only`` is for LeRobot 0.4.4, whose
 robots have no depth streams and which has no `lerobot-rollout`: it records two episodes with packed depth.
 """
@@ -15,6 +16,7 @@ import os
 import pty
 import re
 import select
+import signal
 import subprocess
 import sys
 import tempfile
@@ -24,7 +26,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "lerobot.md"
 LIMIT_S = 1500.0  # of a command
-PROMPT = b"press n"
+PROMPT, ENDED = b"press n", b"the motion has ended"  # answered by the key n, and by Ctrl-C
 PACKED = (
     "lerobot-record --robot.type=rip_twin --robot.depth=packed --robot.seed={seed} --teleop.type=rip_twin_leader "
     "--teleop.pause_s=60 --dataset.repo_id=me/banana --dataset.root=data/banana-packed --dataset.num_episodes=1 "
@@ -76,7 +78,7 @@ def run(command: str, work: Path, env: dict[str, str]) -> str:
         ["bash", "-ec", command], stdin=end, stdout=end, stderr=end, cwd=work, env=env, start_new_session=True
     )
     os.close(end)
-    output, pressed = b"", 0
+    output, pressed, interrupted = b"", 0, False
     while time.monotonic() - start < LIMIT_S:
         if not select.select([terminal], [], [], 1.0)[0]:
             continue
@@ -87,6 +89,9 @@ def run(command: str, work: Path, env: dict[str, str]) -> str:
         while output.count(PROMPT) > pressed:
             pressed += 1
             os.write(terminal, b"n")
+        if ENDED in output and not interrupted:
+            interrupted = True
+            os.killpg(process.pid, signal.SIGINT)
     else:
         process.kill()
     if process.wait():
