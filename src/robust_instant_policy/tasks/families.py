@@ -38,4 +38,24 @@ FAMILIES = (
         ("aloha-pick-banana", "aloha-hang", "aloha-cup-upright", "aloha-sweep", "aloha-pick-place"),
     ),
 )
-BENCHMARKS: tuple[Family, ...] = ()  # tasks of other people's packages, called BENCHMARK/NAME
+BENCHMARKS = (  # tasks of other people's packages, called BENCHMARK/NAME
+    Family(
+        "maniskill_benchmark.task",
+        "sim",
+        tuple(
+            f"maniskill/{name}"
+            for name in (
+                "PickCube",
+                "PushCube",
+                "PullCube",
+                "StackCube",
+                "PlaceSphere",
+                "LiftPegUpright",
+                "PegInsertionSide",
+                "StackPyramid",
+                "PullCubeTool",
+                "RollBall",
+            )
+        ),
+    ),
+)
