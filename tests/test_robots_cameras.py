@@ -243,7 +243,7 @@ def test_a_folder_is_replayed_in_order_and_ends(tmp_path):
 
 
 def test_a_wrong_description_of_a_camera_is_named(tmp_path):
-    with pytest.raises(CellError, match="kind must be one of realsense, lerobot, folder, not 'kinect'"):
+    with pytest.raises(CellError, match="kind must be one of realsense, lerobot, folder, emulated, not 'kinect'"):
         make_camera(DeviceConfig("kinect", {}, "cell.toml: camera"), tmp_path)
     with pytest.raises(CellError, match="widht is not known here"):
         make_camera(DeviceConfig("realsense", {"widht": 640}, "cell.toml: camera"), tmp_path)

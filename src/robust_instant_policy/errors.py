@@ -92,5 +92,9 @@ class RobotError(RipError):
     """An arm, a leader or a camera that is missing, faulty or does not answer."""
 
 
+class StoppedError(RobotError):
+    """A motion was stopped: the arms hold their position; says what was wrong and what to do."""
+
+
 class CalibrationError(RipError):
     """A calibration that the measurements do not determine or contradict; names the likely mistake."""

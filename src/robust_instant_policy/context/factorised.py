@@ -116,7 +116,7 @@ class FactorisedPrompt(Prompt):
 
     def _decoded(self, keypoints: FloatArray, hands: FloatArray) -> Trajectory:
         numbers = from_turns(hands, self.reference)
-        return Trajectory.from_actions(self.frames.joined(self.frames.decode(self.checked(keypoints), numbers)))
+        return Trajectory.from_actions(self.frames.decode(self.checked(keypoints), numbers))
 
     def median_trajectory(self, keypoints: FloatArray) -> Trajectory:
         """The demonstrations' median in each step's frame, without a model: a reference to measure models against."""

@@ -110,25 +110,23 @@ class StepFrames:
         return rows.reshape(len(actions), -1)
 
     def decode(self, keypoints: FloatArray, numbers: FloatArray) -> FloatArray:
-        """The inverse of `encode`, for the first ``len(numbers)`` steps."""
+        """The actions ``(T', 10·A)`` that the first T' steps' ``numbers`` mean in the scene of ``keypoints (K, 3)``.
+
+        The inverse of `encode`, but without the jumps where frames change (`joins`).
+        """
         rows = numbers.reshape(len(numbers), self.num_arms, ACTION_DIM).copy()
         for poses, row in zip(self.poses(keypoints), rows, strict=False):
             for pose, arm in zip(poses, row, strict=True):
                 arm[:STATE_INDEX] = transform_points(pose, _points(arm / MM)).ravel()
-        return rows.reshape(len(numbers), -1)
-
-    def joined(self, actions: FloatArray) -> FloatArray:
-        """``actions (T, 10·A)``, predicted in these frames, without the jumps where frames change (`joins`)."""
-        rows = actions.reshape(len(actions), self.num_arms, ACTION_DIM).copy()
         states = rows[..., STATE_INDEX] > 0.5
         switches = np.flatnonzero((states[1:] != states[:-1]).any(axis=1))
         key_steps = {0, len(rows) - 1, *switches, *(switches + 1)}
         for arm, (own, shown) in enumerate(zip(self.arms, self.jumps, strict=False)):
             if changes := [step for step in range(1, len(rows)) if not own[step].continues(own[step - 1])]:
-                errors = np.array([frame.error for frame in own])
-                hands = joined(hands_of(rows[:, arm])[:, 0], errors, key_steps, changes, shown)
+                errors = np.array([frame.error for frame in own[: len(rows)]])
+                hands = joined(hands_of(rows[:, arm])[:, 0], errors, key_steps, changes, shown[: len(rows) - 1])
                 rows[:, arm, :STATE_INDEX] = hands.reshape(len(rows), STATE_INDEX)
-        return rows.reshape(actions.shape)
+        return rows.reshape(len(numbers), -1)
 
     def variation(self, numbers: FloatArray) -> FloatArray:
         """Standard deviation ``(T,)``, metres, of a point's coordinate over the ``numbers (I, T, 10·A)``."""

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.motion.kinematics import Kinematics
 
-LINES = (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)
+LINES = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 SMALLEST = 1e-12  # squared length of a segment, m², below which it is a point
 
 

@@ -58,7 +58,7 @@ def check_waypoints(trajectory: Trajectory, arms: Sequence[Arm], limits: Limits)
     turns = Rotation.from_matrix(changes.reshape(-1, 3, 3)).magnitude().reshape(changes.shape[:2])
     steps = np.linalg.norm(np.diff(poses[..., :3, 3], axis=0), axis=-1)
     for index, arm in enumerate(arms):
-        _check_workspace(trajectory.triplets[:, index], arm, limits, None)
+        _check_workspace(trajectory.triplets[:, index, 1:], arm, limits, None)
         for values, limit, what, unit, key, scale in (
             (steps[:, index], limits.step, "moves", "m", "step", 1.0),
             (turns[:, index], limits.turn_per_step, "turns", "degrees", "turn_per_step", math.degrees(1.0)),
@@ -98,7 +98,7 @@ def check_motion(motion: Motion, arms: Sequence[Arm], limits: Limits, rate_hz: f
         raise UnreachableError(reason)
     for index, arm in enumerate(arms):
         check_joint_range(motion.joints[:, index], arm, rate_hz)
-    check_space(motion.joints, arms, limits, rate_hz)
+    Space(arms, limits).check(motion.joints, rate_hz)
 
 
 def check_joint_range(joints: FloatArray, arm: Arm, rate_hz: float) -> None:
@@ -112,25 +112,34 @@ def check_joint_range(joints: FloatArray, arm: Arm, rate_hz: float) -> None:
         raise UnreachableError(exceeded(_when(arm, step, rate_hz), what, joints[step, joint], bound, "rad", "model"))
 
 
-def check_space(joints: FloatArray, arms: Sequence[Arm], limits: Limits, rate_hz: float) -> None:
-    """Refuse ``joints (N, A, J)`` that bring a tool out of the workspace, a link to the table, or two arms together."""
-    shapes = [ArmShape(arm.kinematics) for arm in arms]
-    capsules = [shape.at(joints[:, index]) for index, shape in enumerate(shapes)]
-    for index, (arm, shape, links) in enumerate(zip(arms, shapes, capsules, strict=True)):
-        poses = np.array([arm.kinematics.tool_pose(angles) for angles in joints[:, index]])
-        points = arm.triangle.triplets(poses)
-        _check_workspace(points, arm, limits, rate_hz)
-        depth = -points[..., 2].min(axis=-1)
-        _refuse(depth > limits.table_depth, depth, limits.table_depth, arm, "a fingertip goes", "m below the table",
-                "table_depth", rate_hz)  # fmt: skip
-        # A hand works at the table, where its fingertips were checked; of its other parts the axes must stay above.
-        height = links.lowest() + np.where(shape.hand, links.radius, 0.0)
-        least = height[:, shape.near_table].min(axis=1)
-        _refuse(least < 0.0, least, 0.0, arm, "a link has a height above the table of", "m", "model", rate_hz)
-    for one, other in combinations(range(len(arms)), 2):
-        apart = capsules[one].distances(capsules[other]).min(axis=(1, 2))
-        what = f"its distance from {arms[other].name} is"
-        _refuse(apart < limits.arm_distance, apart, limits.arm_distance, arms[one], what, "m", "arm_distance", rate_hz)
+class Space:
+    """Where arms may be: their tools in the workspace, no link at the table, and apart from each other."""
+
+    def __init__(self, arms: Sequence[Arm], limits: Limits):
+        self._arms, self._limits = arms, limits
+        self._shapes = [ArmShape(arm.kinematics) for arm in arms]
+
+    def check(self, joints: FloatArray, rate_hz: float) -> None:
+        """Refuse ``joints (N, A, J)`` with a tool outside the workspace, a link at the table, or two arms together."""
+        limits = self._limits
+        capsules = [shape.at(joints[:, index]) for index, shape in enumerate(self._shapes)]
+        for index, (arm, shape, links) in enumerate(zip(self._arms, self._shapes, capsules, strict=True)):
+            poses = np.array([arm.kinematics.tool_pose(angles) for angles in joints[:, index]])
+            points = arm.triangle.triplets(poses)[:, 1:]
+            _check_workspace(points, arm, limits, rate_hz)
+            depth = -points[..., 2].min(axis=-1)
+            what = "a fingertip goes"
+            _refuse(depth - limits.table_depth, depth, limits.table_depth, arm, what, "m below the table",
+                    "table_depth", rate_hz)  # fmt: skip
+            # A hand works at the table, where its fingertips were checked; of its other parts the axes stay above it.
+            height = links.lowest() + np.where(shape.hand, links.radius, 0.0)
+            least = height[:, shape.near_table].min(axis=1)
+            _refuse(-least, least, 0.0, arm, "a link has a height above the table of", "m", "model", rate_hz)
+        for one, other in combinations(range(len(self._arms)), 2):
+            apart = capsules[one].distances(capsules[other]).min(axis=(1, 2))
+            what = f"its distance from {self._arms[other].name} is"
+            _refuse(limits.arm_distance - apart, apart, limits.arm_distance, self._arms[one], what, "m",
+                    "arm_distance", rate_hz)  # fmt: skip
 
 
 def joint_motion(start: FloatArray, goal: FloatArray, fingers: FloatArray, arms: Sequence[Arm], rate_hz: float,
@@ -227,29 +236,30 @@ def _slowdown(motion: Motion, arms: Sequence[Arm], rate_hz: float) -> tuple[floa
     return worst, reason
 
 
-def _check_workspace(points: FloatArray, arm: Arm, limits: Limits, rate_hz: float | None) -> None:
-    """Refuse tool ``points (N, 3, 3)`` outside the workspace, but on the way from and to the arm's home."""
+def _check_workspace(fingertips: FloatArray, arm: Arm, limits: Limits, rate_hz: float | None) -> None:
+    """Refuse ``fingertips (N, 2, 3)`` outside the workspace, but on the way from and to the arm's home."""
     low, high = limits.workspace[0].copy(), limits.workspace[1]
     low[2] = min(low[2], -limits.table_depth)  # the table has a limit of its own
-    home = arm.triangle.triplets(arm.home_pose)
-    outside = np.maximum(low - points, points - high).max(axis=(1, 2))
+    home = arm.triangle.triplets(arm.home_pose)[1:]
+    outside = np.maximum(low - fingertips, fingertips - high).max(axis=(1, 2))
     beyond = np.maximum(
-        np.minimum(low, home.min(axis=0)) - HOME_MARGIN_M - points,
-        points - np.maximum(high, home.max(axis=0)) - HOME_MARGIN_M,
+        np.minimum(low, home.min(axis=0)) - HOME_MARGIN_M - fingertips,
+        fingertips - np.maximum(high, home.max(axis=0)) - HOME_MARGIN_M,
     ).max(axis=(1, 2))
     inside = np.flatnonzero(outside <= ROUNDING_M)
-    first, last = (inside[0], inside[-1]) if len(inside) else (0, len(points) - 1)
-    excess = np.where((np.arange(len(points)) > first) & (np.arange(len(points)) < last), outside, beyond)
+    first, last = (inside[0], inside[-1]) if len(inside) else (0, len(fingertips) - 1)
+    excess = np.where((np.arange(len(outside)) > first) & (np.arange(len(outside)) < last), outside, beyond)
     if excess.max() > ROUNDING_M:
         step = int(np.argmax(excess))
         what = "its tool is outside the workspace by"
         raise UnreachableError(exceeded(_when(arm, step, rate_hz), what, float(excess[step]), 0.0, "m", "workspace"))
 
 
-def _refuse(bad: np.ndarray, values: FloatArray, limit: float, arm: Arm, what: str, unit: str, key: str,
+def _refuse(excess: FloatArray, values: FloatArray, limit: float, arm: Arm, what: str, unit: str, key: str,
             rate_hz: float) -> None:  # fmt: skip
-    if bad.any():
-        step = int(np.argmax(bad))
+    """Raise an error for the first of ``values (N,)`` with an ``excess`` above 0."""
+    if (excess > ROUNDING_M).any():
+        step = int(np.argmax(excess > ROUNDING_M))
         raise UnreachableError(exceeded(_when(arm, step, rate_hz), what, float(values[step]), limit, unit, key))
 
 

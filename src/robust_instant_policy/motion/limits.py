@@ -21,7 +21,7 @@ FOLLOWING_ERROR_RAD = 0.35
 class Limits:
     """Limits that all arms of a cell share; those of one arm's joints and tool are in `Arm`.
 
-    ``workspace (2, 3)``: lower and upper corner, metres, of the box in which gripper points and fingertips stay;
+    ``workspace (2, 3)``: lower and upper corner, metres, of the box in which fingertips stay;
     ``table_depth``: how deep a fingertip may be commanded below the table, the plane z = 0, metres;
     ``arm_distance``: least distance between the surfaces of two arms, metres; ``turn_per_step`` rad and ``step``
     metres: largest change of a tool between two waypoints of a plan; ``following_error`` rad: largest difference

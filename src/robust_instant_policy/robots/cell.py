@@ -31,6 +31,7 @@ from robust_instant_policy.motion.limits import (
     Limits,
 )
 
+CELLS = Path(__file__).with_name("cells")  # those that come with the package: emulated ones
 MIN_CONFIDENCE = 0.9  # of a plan; below it `rip run` refuses (docs/trust.md)
 FIRST_RUN_SPEED = 0.25  # share of the usual speed, until a first run in a cell has ended well
 
@@ -137,7 +138,8 @@ class ArmConfig:
     """An arm of the cell.
 
     ``model`` is a known one or the path of a URDF; ``base (4, 4)`` its pose in the world; ``park (J,)`` the joint
-    angles, rad, out of the camera's sight, where a run begins; ``gripper`` None for that of the model;
+    angles, rad, out of the camera's sight, where a run begins; ``gripper`` None for that of the model, ``tool (4, 4)``
+    measured tool -> tool of the model, None where they are the same;
     ``joint_speed`` rad/s, ``joint_acceleration`` rad/s² and ``tool_speed`` m/s narrow the model's limits, None leaves
     them.
     """
@@ -147,6 +149,7 @@ class ArmConfig:
     base: FloatArray
     park: FloatArray
     gripper: GripperTriangle | None
+    tool: FloatArray | None
     driver: DeviceConfig
     leader: DeviceConfig | None
     joint_speed: float | None
@@ -177,6 +180,17 @@ class CellConfig:
     camera_calibration: Path | None
     emulation: Mapping[str, Any] | None = field(default=None)
 
+    def emulation_section(self) -> Section:
+        """The table [emulation]; raises `CellError` for a cell with real devices."""
+        if self.emulation is None:
+            raise CellError(f"{self.path} has no table [emulation]: its devices are real")
+        return Section(self.emulation, f"{self.path}: emulation")
+
+    @property
+    def pace(self) -> float:
+        """How much faster than time the cell runs; 1 for real devices."""
+        return 1.0 if self.emulation is None else float(self.emulation.get("pace", 1.0))
+
     @property
     def digest(self) -> str:
         """Digest of the camera's calibration, the grippers and the arms' bases: a plan holds in the cell it was made
@@ -185,12 +199,17 @@ class CellConfig:
         for arm in self.arms:
             gripper = None if arm.gripper is None else [arm.gripper.length, arm.gripper.opening]
             parts.append([arm.name, arm.model, np.round(arm.base, 6).tolist(), gripper])
+            if arm.tool is not None:
+                parts.append(np.round(arm.tool, 6).tolist())
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
     @classmethod
     def load(cls, path: str | Path) -> CellConfig:
-        """Read a cell's file. Raises `CellError` in one line that names the key."""
+        """Read a cell's file, or one of those in `CELLS` by its name. Raises `CellError` in one line that names the
+        key."""
         path = Path(path)
+        if not path.exists() and (CELLS / f"{path.name}.toml").exists():
+            path = CELLS / f"{path.name}.toml"
         root = read_section(path)
         cell = root.section("cell")
         arms = tuple(_arm(section, path) for section in root.sections("arms"))
@@ -243,6 +262,12 @@ def read_gripper(path: Path) -> GripperTriangle:
     return _gripper(read_section(path))
 
 
+def read_tool(path: Path) -> FloatArray | None:
+    """``tool (4, 4)`` of a gripper's file, measured tool -> tool of the arm's model; None without it."""
+    section = read_section(path)
+    return section.array("tool", (4, 4)) if "tool" in section else None
+
+
 def _gripper(section: Section) -> GripperTriangle:
     return GripperTriangle(
         section.number("length", least=0.002, most=1.0), section.number("opening", least=0.002, most=0.5)
@@ -266,16 +291,17 @@ def _limits(cell: Section) -> Limits:
 def _arm(section: Section, path: Path) -> ArmConfig:
     name = section.text("name")
     base = section.array("base", (6,), [0.0] * 6)
-    gripper = None
+    gripper = tool = None
     if "gripper" in section:
-        file = section.text("gripper")
-        gripper = read_gripper(path.parent / file)
+        file = path.parent / section.text("gripper")
+        gripper, tool = read_gripper(file), read_tool(file)
     config = ArmConfig(
         name=name,
         model=section.text("model"),
         base=make_pose(Rotation.from_euler("xyz", base[3:], degrees=True).as_matrix(), base[:3]),
         park=section.array("park", (None,)),
         gripper=gripper,
+        tool=tool,
         driver=DeviceConfig.read(section.section("driver"), f"{path}: driver of {name}"),
         leader=DeviceConfig.read(section.section("leader"), f"{path}: leader of {name}")
         if "leader" in section

@@ -14,6 +14,10 @@ class Leader(Protocol):
 
     def connect(self) -> None: ...
 
+    def start(self) -> None:
+        """Called before leading begins: where the leader was before does not matter."""
+        ...
+
     def read(self, follower: ArmState) -> Command:
         """The command for the follower now.
 

@@ -11,10 +11,11 @@ from robust_instant_policy.robots.cameras.lerobot import LeRobotCamera
 from robust_instant_policy.robots.cameras.realsense import RealSenseCamera
 from robust_instant_policy.robots.cameras.recorded import RecordedCamera
 from robust_instant_policy.robots.cell import DeviceConfig
+from robust_instant_policy.robots.emulation.client import EmulatedCamera
 
 __all__ = ["LeRobotCamera", "RealSenseCamera", "RecordedCamera", "make_camera"]
 
-KINDS = ("realsense", "lerobot", "folder")
+KINDS = ("realsense", "lerobot", "folder", "emulated")
 
 
 def make_camera(config: DeviceConfig, relative_to: Path) -> Camera:
@@ -31,6 +32,8 @@ def make_camera(config: DeviceConfig, relative_to: Path) -> Camera:
             section.whole("height", 480, least=1),
             section.whole("rate_hz", 30, least=1),
         )
+    elif config.kind == "emulated":
+        camera = EmulatedCamera(section.text("url"))
     elif config.kind == "folder":
         camera = RecordedCamera(relative_to / section.text("path"))
     elif config.kind == "lerobot":

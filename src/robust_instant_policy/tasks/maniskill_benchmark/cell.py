@@ -90,6 +90,17 @@ class PandaCell:
         """The start pose ``(1, J)`` that the environment drew."""
         return self.env.agent.robot.get_qpos()[:, :NUM_JOINTS].cpu().numpy().astype(np.float64)
 
+    def measured(self) -> FloatArray:
+        """Joint angles and finger travel, ``(8,)``."""
+        return self.env.agent.robot.get_qpos()[0, : NUM_JOINTS + 1].cpu().numpy().astype(np.float64)
+
+    def grip_loads(self) -> FloatArray:
+        """Force of the gripper as a share of its limit, ``(1,)``, from the deflection of its drive."""
+        agent = self.env.agent
+        target = float(agent.controller.controllers["gripper"]._target_qpos[0, 0])
+        force = agent.gripper_stiffness * (self.measured()[-1] - target)
+        return np.array([min(abs(force) / agent.gripper_force_limit, 1.0)])
+
     def tool_poses(self) -> FloatArray:
         return matrix(self.env.agent.tcp.pose)[None]
 
