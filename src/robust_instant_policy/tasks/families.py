@@ -7,6 +7,8 @@ from importlib import import_module
 from typing import Any
 
 from robust_instant_policy.errors import MissingExtraError
+from robust_instant_policy.tasks.maniskill_benchmark.benchmark import MANISKILL
+from robust_instant_policy.tasks.metaworld.benchmark import METAWORLD
 
 
 @dataclass(frozen=True)
@@ -39,23 +41,6 @@ FAMILIES = (
     ),
 )
 BENCHMARKS = (  # tasks of other people's packages, called BENCHMARK/NAME
-    Family(
-        "maniskill_benchmark.task",
-        "sim",
-        tuple(
-            f"maniskill/{name}"
-            for name in (
-                "PickCube",
-                "PushCube",
-                "PullCube",
-                "StackCube",
-                "PlaceSphere",
-                "LiftPegUpright",
-                "PegInsertionSide",
-                "StackPyramid",
-                "PullCubeTool",
-                "RollBall",
-            )
-        ),
-    ),
+    Family("metaworld.task", "metaworld", METAWORLD.tasks),
+    Family("maniskill_benchmark.task", "sim", MANISKILL.tasks),
 )

@@ -11,6 +11,7 @@ from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.tasks.level import make_level
 from robust_instant_policy.tasks.maniskill.renderer import require_renderer
 from robust_instant_policy.tasks.maniskill_benchmark import demonstrators
+from robust_instant_policy.tasks.maniskill_benchmark.benchmark import PREFIX
 from robust_instant_policy.tasks.maniskill_benchmark.cell import PandaCell, View
 from robust_instant_policy.tasks.maniskill_benchmark.robot import panda
 from robust_instant_policy.tasks.simulated_task import Expert, SimulatedTask, TaskSpec, Timing
@@ -77,7 +78,7 @@ class PandaTask(SimulatedTask):
         own, env_id = SPECS[name], f"{name}-v1"
         cell = PandaCell(env_id, own.view)
         cell.reset(seed=0)
-        spec = TaskSpec(f"maniskill/{name}", own.description, own.goal, env_id, own.expert)
+        spec = TaskSpec(f"{PREFIX}{name}", own.description, own.goal, env_id, own.expert)
         super().__init__(spec, cell, [panda(cell.base)], TIMING, np.array(own.workspace), make_level(level))
         gc.collect()  # as in `maniskill.task.CellTask`
         gc.freeze()
@@ -96,4 +97,4 @@ def make(name: str, objects: str, assets: str, level: str) -> PandaTask:
     ):
         if asked not in known:
             raise UnknownNameError(what, asked, known)
-    return PandaTask(name.partition("/")[2], level)
+    return PandaTask(name.removeprefix(PREFIX), level)
