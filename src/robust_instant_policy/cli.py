@@ -25,6 +25,7 @@ COMMANDS = {
     "view": "write a page that shows every demonstration of a folder",
     "keypoints": "write a page with the keypoints of demonstrations and new scenes, and their errors",
     "samples": "count or export the stored answers of a language model",
+    "studio": "open a page in the browser to demonstrate by hand, look at plans, and execute them",
     "doctor": "check this machine, and say how to install what is missing",
 }
 

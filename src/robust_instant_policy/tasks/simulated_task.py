@@ -105,6 +105,20 @@ class SimulatedTask:
         self._seed: int | None = None
         self._fresh = False  # no motion since the scene was built
 
+    @property
+    def cell(self) -> Cell:
+        """The scene, for operation by hand."""
+        return self._cell
+
+    @property
+    def arms(self) -> Sequence[Arm]:
+        """The working arms, at home where the scene of the last `reset` has them."""
+        return self._arms
+
+    @property
+    def timing(self) -> Timing:
+        return self._timing
+
     def reset(self, seed: int) -> Observation:
         self._rebuild(seed)
         return self._photograph()

@@ -1,0 +1,211 @@
+"""The studio in a real browser: headless Chromium, drawing by software, against the real simulator."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.sanity import check_demonstrations
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed; run: make setup")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+PATIENCE_S = 60.0
+
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium; run: make setup (Debian), or install one")
+
+
+class Studio:
+    """A running studio, and a browser that looks at it."""
+
+    def __init__(self, page, address: str, folder, browser):
+        self.page, self.address, self.folder = page, address, folder
+        self.session = page.session
+        self.browser = browser
+        self.view = self.another_view()
+
+    def another_view(self):
+        view = self.browser.new_page(viewport={"width": 900, "height": 600})
+        view.goto(self.address)
+        return view
+
+    def banner(self, text: str, view=None) -> None:
+        """Wait until the banner says ``text``."""
+        (view or self.view).wait_for_function(
+            "text => document.querySelector('#studio-banner')?.textContent.includes(text)",
+            arg=text,
+            timeout=1000 * PATIENCE_S,
+        )
+
+    def press(self, key: str, times: int = 1) -> None:
+        for _ in range(times):
+            self.view.keyboard.press(key)
+
+    def tool(self) -> FloatArray:
+        return self.session.cell.tool_poses()[0, :3, 3]
+
+    def picture(self) -> np.ndarray:
+        """The scene's pixels, without the panel."""
+        shot = self.view.screenshot(clip={"x": 0, "y": 0, "width": 480, "height": 600})
+        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), dtype=float)
+
+    def pixel(self, point: FloatArray) -> FloatArray:
+        """Where the browser draws the world ``point (3,)``."""
+        camera = next(iter(self.page._server.get_clients().values())).camera
+        forward = camera.look_at - camera.position
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        away = point - camera.position
+        depth = away @ forward
+        height = np.array([away @ right, -away @ np.cross(right, forward)]) / depth / np.tan(camera.fov / 2)
+        size = self.view.evaluate(
+            "(({width, height}) => [width, height])(document.querySelector('canvas').getBoundingClientRect())"
+        )
+        return np.array(size) / 2 + height * size[1] / 2
+
+
+def wait_until(true: Callable[[], bool], what: str) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < end, what
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator:
+    with playwright.sync_playwright() as api:
+        browser = api.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def studio(browser, tmp_path_factory) -> Iterator[Studio]:
+    from robust_instant_policy.studio.server import studio
+
+    folder = tmp_path_factory.mktemp("studio") / "push-cube"
+    with studio("push-cube", folder, folder.parent, "embedded", "127.0.0.1", 0) as (page, address):
+        thread = threading.Thread(target=page.session.run, daemon=True)
+        thread.start()
+        try:
+            opened = Studio(page, address, folder, browser)
+            opened.banner("Your turn")
+            yield opened
+        finally:
+            page.session.post(page.session.close)
+            page.session.stop()
+            thread.join(PATIENCE_S)
+
+
+@needs_browser
+def test_the_arm_follows_the_handle_that_is_dragged(studio):
+    before, picture = studio.tool(), studio.picture()
+    start = studio.pixel(before)
+    mouse = studio.view.mouse
+    mouse.move(start[0] + 26, start[1])  # the arrow along x
+    mouse.down()
+    for share in np.linspace(0, 1, 12):
+        mouse.move(start[0] + 26 + 60 * share, start[1])
+        time.sleep(0.03)
+    mouse.up()
+    studio.banner("Recording")
+    wait_until(lambda: studio.tool()[0] - before[0] > 0.02, "the gripper moves along x")
+    np.testing.assert_allclose(studio.tool()[1:], before[1:], atol=0.005)
+    wait_until(lambda: np.abs(studio.picture() - picture).max(axis=2).__gt__(40).sum() > 500, "the picture shows it")
+    studio.press("x")
+    studio.banner("Your turn")
+    np.testing.assert_allclose(studio.tool(), before, atol=0.002)
+
+
+@needs_browser
+def test_what_the_arm_cannot_reach_is_said_and_not_jumped_to(studio):
+    studio.press("u", 140)
+    studio.banner("Out of reach")
+    assert studio.tool()[2] < 1.0
+    studio.press("x")
+    studio.banner("Your turn")
+
+
+@needs_browser
+def test_a_demonstration_by_keys_is_kept_like_any_other(studio):
+    start = studio.session.observation
+    goal = studio.session.cell.poses()["goal"][:3, 3]
+    cube = studio.session.cell.poses()["cube"][:3, 3]
+
+    def go(target: FloatArray) -> None:
+        """Press the keys that lead to ``target``, up first and down last."""
+        for axis, (more, less) in ((2, "uo"), (0, "lj"), (1, "ik"), (2, "uo")):
+            ahead = target[axis] - studio.session._targets[0][axis, 3]
+            if (ahead > 0) or axis != 2 or target[2] < 0.05:
+                studio.press(more if ahead > 0 else less, round(abs(ahead) / 0.005))
+                wait_until(lambda: not studio.session.status.refusal, "the way is free")
+                time.sleep(0.1)
+        wait_until(lambda: np.linalg.norm(studio.tool() - target) < 0.012, f"the gripper is at {target}")
+
+    studio.press("Space")
+    go(cube + np.array([-0.085, 0, 0.1]))
+    go(cube + np.array([-0.085, 0, -0.005]))
+    go(goal * [1, 1, 0] + np.array([-0.02, 0, 0.015]))
+    studio.banner("Press Enter")
+    long = studio.session.status.seconds
+    studio.press("z")  # one second back, and to the end again
+    wait_until(lambda: studio.session.status.seconds < long - 0.5, "time goes back")
+    studio.press("i", 2)
+    go(goal * [1, 1, 0] + np.array([-0.02, 0.01, 0.015]))
+    studio.banner("Press Enter")
+    studio.press("Enter")
+    studio.banner("Your turn")
+    (kept,) = load_demonstrations(studio.folder, task="push-cube")
+    assert not check_demonstrations([kept]).findings
+    assert kept.rate_hz == 55
+    np.testing.assert_array_equal(kept.observation.rgb, start.rgb)
+    assert kept.trajectory.gripper_state[0, 0] == 0
+    assert kept.trajectory.gripper_state[-1, 0] == 1
+    speed = np.linalg.norm(np.diff(kept.trajectory.triplets[:, 0, 0], axis=0), axis=1) * kept.rate_hz
+    assert speed.max() < 0.6
+    assert kept.seconds < long
+
+
+@needs_browser
+def test_a_second_browser_looks_on_until_it_takes_the_controls(studio):
+    other = studio.another_view()
+    studio.banner("Your turn", other)
+    other.get_by_text("Another scene").click()
+    other.get_by_text("Another browser holds the controls").wait_for(timeout=1000 * PATIENCE_S)
+    seed = studio.session.seed
+    other.get_by_text("Take the controls").click()
+    other.get_by_text("Another scene").click()
+    wait_until(lambda: studio.session.seed == seed + 1, "the scene changes")
+    other.close()
+    studio.view.get_by_text("Another scene").click()
+    wait_until(lambda: studio.session.seed == seed + 2, "the first browser has the controls again")
+
+
+def test_an_address_for_others_needs_its_token_and_no_other_web_site_may_use_the_page():
+    from robust_instant_policy.studio.gate import Gate, admit
+
+    gate = Gate("0.0.0.0", 0, 1)
+    try:
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(f"http://127.0.0.1:{gate.port}/", timeout=10)
+        token = gate.address.rsplit("/", 1)[-1]
+        assert len(token) > 20
+    finally:
+        gate.close()
+    head = "GET /{} HTTP/1.1\r\nHost: {}\r\nOrigin: {}\r\n\r\n"
+    assert admit(head.format("secret", "robot:80", "http://robot:80"), "secret", False)[1] == ""
+    assert "token" in admit(head.format("other", "robot:80", "http://robot:80"), "secret", False)[1]
+    assert "web site" in admit(head.format("", "localhost:80", "http://bad.example"), "", True)[1]
+    assert "this machine" in admit(head.format("", "bad.example:80", "http://bad.example:80"), "", True)[1]
