@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import queue
 import shutil
 import threading
 import time
@@ -20,6 +21,7 @@ from robust_instant_policy.sanity import check_demonstrations
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed; run: make setup")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+KEYS = {"x": "lj", "y": "ik", "z": "uo"}  # forward and back
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 PATIENCE_S = 60.0
 
@@ -52,8 +54,23 @@ class Studio:
         for _ in range(times):
             self.view.keyboard.press(key)
 
+    def ask(self, question: Callable):
+        """The answer of ``question(session)``, asked in the session's thread."""
+        answers: queue.SimpleQueue = queue.SimpleQueue()
+        self.session.post(lambda: answers.put(question(self.session)))
+        return answers.get(timeout=PATIENCE_S)
+
     def tool(self) -> FloatArray:
-        return self.session.cell.tool_poses()[0, :3, 3]
+        return self.ask(lambda session: session.cell.tool_poses()[0, :3, 3])
+
+    def target(self) -> FloatArray:
+        return self.ask(lambda session: session._targets[0, :3, 3].copy())
+
+    def seconds(self) -> float:
+        return self.ask(lambda session: session.status.seconds)
+
+    def position(self, body: str) -> FloatArray:
+        return self.ask(lambda session: session.cell.poses()[body][:3, 3])
 
     def picture(self) -> np.ndarray:
         """The scene's pixels, without the panel."""
@@ -93,10 +110,10 @@ def browser() -> Iterator:
 
 @pytest.fixture(scope="module")
 def studio(browser, tmp_path_factory) -> Iterator[Studio]:
-    from robust_instant_policy.studio.server import studio
+    from robust_instant_policy.studio.server import Choice, studio
 
     folder = tmp_path_factory.mktemp("studio") / "push-cube"
-    with studio("push-cube", folder, folder.parent, "embedded", "127.0.0.1", 0) as (page, address):
+    with studio(Choice("push-cube", folder, folder.parent), "127.0.0.1", 0) as (page, address):
         thread = threading.Thread(target=page.session.run, daemon=True)
         thread.start()
         try:
@@ -114,10 +131,10 @@ def test_the_arm_follows_the_handle_that_is_dragged(studio):
     before, picture = studio.tool(), studio.picture()
     start = studio.pixel(before)
     mouse = studio.view.mouse
-    mouse.move(start[0] + 26, start[1])  # the arrow along x
+    mouse.move(start[0] + 46, start[1])  # the arrow along x
     mouse.down()
     for share in np.linspace(0, 1, 12):
-        mouse.move(start[0] + 26 + 60 * share, start[1])
+        mouse.move(start[0] + 46 + 60 * share, start[1])
         time.sleep(0.03)
     mouse.up()
     studio.banner("Recording")
@@ -131,9 +148,10 @@ def test_the_arm_follows_the_handle_that_is_dragged(studio):
 
 @needs_browser
 def test_what_the_arm_cannot_reach_is_said_and_not_jumped_to(studio):
-    studio.press("u", 140)
+    studio.press("l", 180)
     studio.banner("Out of reach")
-    assert studio.tool()[2] < 1.0
+    reach = np.linalg.norm(studio.tool() - studio.position("base"))
+    assert 0.8 < reach < 1.1
     studio.press("x")
     studio.banner("Your turn")
 
@@ -141,29 +159,29 @@ def test_what_the_arm_cannot_reach_is_said_and_not_jumped_to(studio):
 @needs_browser
 def test_a_demonstration_by_keys_is_kept_like_any_other(studio):
     start = studio.session.observation
-    goal = studio.session.cell.poses()["goal"][:3, 3]
-    cube = studio.session.cell.poses()["cube"][:3, 3]
+    goal = studio.position("goal")
+    cube = studio.position("cube")
 
-    def go(target: FloatArray) -> None:
-        """Press the keys that lead to ``target``, up first and down last."""
-        for axis, (more, less) in ((2, "uo"), (0, "lj"), (1, "ik"), (2, "uo")):
-            ahead = target[axis] - studio.session._targets[0][axis, 3]
-            if (ahead > 0) or axis != 2 or target[2] < 0.05:
-                studio.press(more if ahead > 0 else less, round(abs(ahead) / 0.005))
-                wait_until(lambda: not studio.session.status.refusal, "the way is free")
-                time.sleep(0.1)
-        wait_until(lambda: np.linalg.norm(studio.tool() - target) < 0.012, f"the gripper is at {target}")
+    def go(target: FloatArray, axes: str) -> None:
+        """Press the keys that lead to ``target`` along ``axes``, one after the other."""
+        for axis, more, less in (("xyz".index(name), *KEYS[name]) for name in axes):
+            start = studio.target()[axis]
+            steps = round((target[axis] - start) / 0.005)
+            studio.press(more if steps > 0 else less, abs(steps))
+            goal = start + 0.005 * steps
+            wait_until(lambda axis=axis, goal=goal: abs(studio.target()[axis] - goal) < 1e-6, "keys")
+        wait_until(lambda: np.linalg.norm(studio.tool() - target) < 0.012, f"{studio.ask(vars)} is at {target}")
 
     studio.press("Space")
-    go(cube + np.array([-0.085, 0, 0.1]))
-    go(cube + np.array([-0.085, 0, -0.005]))
-    go(goal * [1, 1, 0] + np.array([-0.02, 0, 0.015]))
+    go(cube + np.array([-0.085, 0, 0.1]), "zyx")
+    go(cube + np.array([-0.085, 0, -0.005]), "z")
+    go(goal * [1, 1, 0] + np.array([-0.02, 0, 0.015]), "x")
     studio.banner("Press Enter")
-    long = studio.session.status.seconds
-    studio.press("z")  # one second back, and to the end again
-    wait_until(lambda: studio.session.status.seconds < long - 0.5, "time goes back")
+    long = studio.seconds()
+    studio.press("z")  # a second back, and to the end again
+    wait_until(lambda: studio.seconds() < long - 0.5, "time goes back")
     studio.press("i", 2)
-    go(goal * [1, 1, 0] + np.array([-0.02, 0.01, 0.015]))
+    go(goal * [1, 1, 0] + np.array([-0.02, 0.01, 0.015]), "x")
     studio.banner("Press Enter")
     studio.press("Enter")
     studio.banner("Your turn")

@@ -24,11 +24,14 @@ class Follower:
     def __init__(self, arms: Sequence[Arm], control_hz: float):
         self.arms, self.control_hz = arms, control_hz
         self.motion = Motion.at_home(arms)
+        self._refused: tuple[FloatArray, np.ndarray, str] | None = (
+            None  # of the last targets, no part of whose way is free
+        )
         self._speed = min(arm.tool_speed for arm in arms) / 2  # that of `plan_onward`
 
     def resume(self, motion: Motion) -> None:
         """Go on from the end of ``motion``."""
-        self.motion = motion
+        self.motion, self._refused = motion, None
 
     def towards(self, targets: FloatArray, closed: np.ndarray) -> tuple[Motion | None, str]:
         """The next motion towards ``targets (A, 4, 4)`` with gripper states ``closed (A,)`` bool.
@@ -40,6 +43,11 @@ class Follower:
         here = self.motion.poses[-1]
         if (closed == self.motion.closed[-1]).all() and all(map(_arrived, here, targets)):
             return None, ""
+        if self._refused is not None:
+            refused, states, refusal = self._refused
+            if np.array_equal(refused, targets) and (states == closed).all():
+                return None, refusal
+            self._refused = None
         whole = np.stack([self._step(*pair) for pair in zip(here, self._above_table(targets), strict=True)])
         try:
             return self._plan(whole, closed), ""
@@ -57,6 +65,8 @@ class Follower:
                     continue
                 reached = attempt
                 break
+        if best is None:
+            self._refused = targets.copy(), closed.copy(), refusal
         return best, refusal
 
     def _plan(self, poses: FloatArray, closed: np.ndarray) -> Motion:

@@ -14,11 +14,12 @@ import re
 import secrets
 import socket
 import threading
+from concurrent.futures import Future
 
 from robust_instant_policy.errors import UsageError
 
 LONGEST_HEAD = 16_384  # bytes of a request before its body
-HEAD_TIMEOUT_S, CLOSE_TIMEOUT_S = 10.0, 2.0
+HEAD_TIMEOUT_S = 10.0
 REFUSAL = "HTTP/1.1 403 Forbidden\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n"
 
 
@@ -31,25 +32,31 @@ class Gate:
     def __init__(self, host: str, port: int, inner: int):
         self._host, self._inner = host, inner
         self._token = "" if is_loopback(host) else secrets.token_urlsafe(16)
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="gate", daemon=True)
+        listening: Future[int] = Future()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run(port, listening)), daemon=True)
         self._thread.start()
-        listening = asyncio.start_server(self._serve, host, port)
         try:
-            server = asyncio.run_coroutine_threadsafe(listening, self._loop).result()
+            self.port = listening.result()
         except OSError as error:
-            self.close()
             raise UsageError(f"{host}:{port} cannot be listened on ({error.strerror}); choose another --port") from None
-        self.port = server.sockets[0].getsockname()[1]
         name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         self.address = f"http://{name}:{self.port}/{self._token}".rstrip("/")
 
     def close(self) -> None:
         """Close all connections."""
-        with contextlib.suppress(TimeoutError):
-            asyncio.run_coroutine_threadsafe(_cancel_others(), self._loop).result(CLOSE_TIMEOUT_S)
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(CLOSE_TIMEOUT_S)
+        self._loop.call_soon_threadsafe(self._stopped.set)
+        self._thread.join()
+
+    async def _run(self, port: int, listening: Future[int]) -> None:
+        self._loop, self._stopped = asyncio.get_running_loop(), asyncio.Event()
+        try:
+            server = await asyncio.start_server(self._serve, self._host, port)
+        except OSError as error:
+            listening.set_exception(error)
+            return
+        listening.set_result(server.sockets[0].getsockname()[1])
+        await self._stopped.wait()
+        server.close()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         inner: asyncio.StreamWriter | None = None
@@ -63,6 +70,8 @@ class Gate:
             answers, inner = await asyncio.open_connection("127.0.0.1", self._inner)
             inner.write(passed.encode("latin-1"))
             await asyncio.gather(_copy(reader, inner), _copy(answers, writer))
+        except asyncio.CancelledError:
+            return  # the gate closes; asyncio's streams would report a cancelled task as an error
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # the browser went away, or is none
         finally:
@@ -102,13 +111,6 @@ def admit(head: str, token: str, loopback: bool) -> tuple[str, str]:
             return "", "open the whole address that rip studio printed; it ends with a token"
         path = "/" + rest
     return head.replace(match[1], path, 1), ""
-
-
-async def _cancel_others() -> None:
-    others = asyncio.all_tasks() - {asyncio.current_task()}
-    for task in others:
-        task.cancel()
-    await asyncio.gather(*others, return_exceptions=True)
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

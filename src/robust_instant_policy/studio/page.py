@@ -18,8 +18,8 @@ from robust_instant_policy.evaluation.scenes import stored_demonstrations
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.studio.cell import Cell
 from robust_instant_policy.studio.controls import Controls
+from robust_instant_policy.studio.plan_panel import PlanPanel
 from robust_instant_policy.studio.session import Session, Status
-from robust_instant_policy.studio.simulated import SimulatedCell
 from robust_instant_policy.studio.stage import Stage, place, pose_of
 
 NUDGE_M, NUDGE_RAD = 0.005, np.deg2rad(5)
@@ -43,12 +43,24 @@ HOW_TO = """
 
 
 class Page:
-    """The page, a `session.Watcher`. ``folder_of`` names the folder of a task's demonstrations."""
+    """The page, a `session.Watcher`.
 
-    def __init__(self, server: viser.ViserServer, tasks: Sequence[str], folder_of: Callable[[str], Path]):
+    ``folder_of`` names the folder of a task's demonstrations, ``make_cell`` makes the cell of a task that was
+    demonstrated so far as it is told; ``llm`` is as in `llm.connect`.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        tasks: Sequence[str],
+        folder_of: Callable[[str], Path],
+        make_cell: Callable[[str, Sequence[Demonstration]], Cell],
+        llm: str,
+    ):
         self.session = Session(self)
         self.demonstrations: list[Demonstration] = []
-        self._server, self._gui, self._folder_of = server, server.gui, folder_of
+        self._server, self._gui = server, server.gui
+        self._folder_of, self._make_cell = folder_of, make_cell
         self._stage, self._controls = Stage(server), Controls(server)
         self._arm = 0  # moved by keys
         self._gripped_at = 0.0
@@ -57,7 +69,7 @@ class Page:
         self._grippers: tuple[str, ...] = ()
         server.on_client_disconnect(self._forget_drag)
         self._gui.configure_theme(
-            brand_color=BRAND, show_logo=False, show_share_button=False, control_width="large", dark_mode=False
+            brand_color=BRAND, show_logo=False, show_share_button=False, control_width="medium", dark_mode=False
         )
         self._gui.main_panel.dock_right()
         self._banner = self._gui.add_html("")
@@ -67,6 +79,16 @@ class Page:
         self.tabs = self._gui.add_tab_group()
         with self.tabs.add_tab("Show", viser.Icon.HAND_MOVE):
             self._build()
+        self.plans = PlanPanel(
+            self._gui,
+            self._stage,
+            self.tabs,
+            self.session,
+            self._controls,
+            lambda: self.demonstrations,
+            self.on_message,
+            llm,
+        )
         self._bind_keys()
 
     @property
@@ -81,6 +103,7 @@ class Page:
 
     def on_scene(self, cell: Cell, observation: Observation) -> None:
         self._stage.show_cell(cell)
+        self.plans.show_scene(observation)
         names = tuple(arm.name for arm in cell.arms)
         if names != self._grippers:
             self._grippers, self._arm, self._dragged = names, 0, None
@@ -153,7 +176,8 @@ class Page:
         self.demonstrations = stored_demonstrations(folder, task, MANY) if folder.exists() else []
         seeds = [one.seed for one in self.demonstrations if one.seed is not None]
         self._count()
-        self.session.open(lambda: SimulatedCell(task), max(seeds, default=-1) + 1)
+        first = max(seeds, default=-1) + 1
+        self.session.open(lambda: self._make_cell(task, self.demonstrations), first)
 
     def _count(self) -> None:
         kept = len(self.demonstrations)
@@ -211,13 +235,15 @@ class Page:
         cell = self.session.cell
         if status.refusal:
             return ORANGE, f"Out of reach: {status.refusal}"
+        if cell is not None and not cell.arms:
+            return BLUE, f"{cell.description}: demonstrations of a folder. Choose a scene and press Plan."
         if status.phase == "ready":
             return BLUE, f"Your turn: {cell.description if cell else ''}. Recording begins as you move the gripper."
         if status.phase == "recording":
             seconds = f"● Recording, {np.floor(status.seconds * 2) / 2:.1f} s. "
             if status.failure == "":
                 return GREEN, f"{seconds}Done: {cell.goal if cell else ''}. Press Enter to keep it."
-            return RED, f"{seconds}Not done yet{': ' + status.failure if status.failure else ''}"
+            return GREY, f"{seconds}Not done yet{': ' + status.failure if status.failure else ''}"
         if status.phase == "playing":
             return BLUE, "The arm executes the plan."
         return GREY, "The scene was used. Begin again (X), or choose another scene."

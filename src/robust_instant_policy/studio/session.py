@@ -100,7 +100,7 @@ class Session:
             if self.cell is None or not self.cell.arms:
                 due = time.monotonic() + 1 / FRAME_HZ
                 continue
-            while due <= time.monotonic() and not self._stopped:
+            if due <= now:
                 self._tick()
                 due += 1 / self.cell.control_hz
             if (now := time.monotonic()) - judged > 1 / JUDGE_HZ:
@@ -174,7 +174,7 @@ class Session:
         end = take.poses[-1][None], take.closed[-1][None]
         self._follower.resume(Motion(joints[None, :, :-1], joints[None, :, -1], *end))
         self._targets, self._closed = take.poses[-1].copy(), take.closed[-1].copy()
-        self._set(phase="recording")
+        self._set(phase="recording", seconds=len(take) / self.cell.control_hz)
 
     def discard(self) -> None:
         """Begin again in the same scene."""
@@ -212,11 +212,19 @@ class Session:
         """Let the arms run ``motion``, which begins at home; ``on_played`` receives `Cell.failure` at the end."""
         if self.status.phase != "ready":
             self.discard()
-        self._steps.extend(zip(motion.commands, motion.poses, motion.closed, strict=True))
+        self._queue(motion)
         self._on_played = on_played
         assert self._follower is not None
         self._follower.resume(motion)
         self._set(phase="playing")
+
+    def rehearse(self, motion: Motion) -> str | None:
+        """Run ``motion``, which begins at home, at once and from the beginning of the scene; returns `Cell.failure`."""
+        self._draw(self.seed)
+        assert self.cell is not None
+        for command in motion.commands:
+            self.cell.advance(command)
+        return self.cell.failure()
 
     def abort(self) -> None:
         """Stop a plan that is being played."""
@@ -272,9 +280,10 @@ class Session:
             if refusal != self.status.refusal:
                 self._set(refusal=refusal)
             if motion is not None:
-                self._steps.extend(zip(motion.commands, motion.poses, motion.closed, strict=True))
                 if phase == "ready":
                     phase = "recording"
+                    self._queue(Motion.at_home(self.cell.arms))  # a demonstration begins open, at home
+                self._queue(motion)
         if phase == "ready":
             return  # the scene waits, so that a recording can be replayed from its beginning
         if self._steps:
@@ -290,6 +299,9 @@ class Session:
             if seconds > LONGEST_TAKE_S:
                 self.discard()
                 self._watcher.on_message(f"discarded: a demonstration may take {LONGEST_TAKE_S:.0f} s")
+
+    def _queue(self, motion: Motion) -> None:
+        self._steps.extend(zip(motion.commands, motion.poses, motion.closed, strict=True))
 
     def _played(self) -> None:
         assert self.cell is not None

@@ -17,7 +17,7 @@ from robust_instant_policy.studio.cell import Cell, Surface
 
 GIZMO_M = 0.2
 MOVED = 1e-4  # entries of a pose that change by less are not sent
-EYE, LOOK_AT = (-0.02, -0.95, 0.68), (-0.05, 0.0, 0.08)  # of a new browser, m
+EYE, LOOK_AT = (-0.06, -1.1, 0.75), (-0.08, 0.0, 0.1)  # of a new browser, m
 POINT_M = 0.003
 REFUSED = (214, 40, 57)
 
@@ -26,19 +26,19 @@ class Stage:
     """What of a cell is drawn in ``server``'s scene."""
 
     def __init__(self, server: viser.ViserServer):
-        self._scene = server.scene
+        self.scene = server.scene
         self._server = server
         self._bodies: dict[str, tuple[str, Any]] = {}  # digest of its surfaces, and handle
         self._shown: dict[str, FloatArray] = {}
         self.gizmos: list[viser.TransformControlsHandle] = []
         server.initial_camera.position, server.initial_camera.look_at = EYE, LOOK_AT
-        self._scene.configure_environment_map(None)  # without a GPU its light takes a second a picture
-        self._scene.configure_default_lights(False)
-        self._scene.add_light_hemisphere(
+        self.scene.configure_environment_map(None)  # without a GPU its light takes a second a picture
+        self.scene.configure_default_lights(False)
+        self.scene.add_light_hemisphere(
             "/light/sky", sky_color=(255, 255, 255), ground_color=(190, 180, 170), intensity=2.0
         )
-        self._scene.add_light_directional("/light/lamp", intensity=1.6, position=(-0.6, -0.9, 1.6))
-        self._scene.world_axes.visible = False
+        self.scene.add_light_directional("/light/lamp", intensity=1.6, position=(-0.6, -0.9, 1.6))
+        self.scene.world_axes.visible = False
         self._points: viser.PointCloudHandle | None = None
         self._ways: list[viser.LineSegmentsHandle] = []
 
@@ -65,11 +65,11 @@ class Stage:
         for node in (*self.gizmos, *self._ways):
             node.remove()
         self.gizmos = [
-            self._scene.add_transform_controls(f"/gripper/{name}", scale=GIZMO_M, depth_test=False, line_width=4.0)
+            self.scene.add_transform_controls(f"/gripper/{name}", scale=GIZMO_M, depth_test=False, line_width=4.0)
             for name in names
         ]
         self._ways = [
-            self._scene.add_line_segments(
+            self.scene.add_line_segments(
                 f"/way/{name}", np.zeros((1, 2, 3)), REFUSED, thickness=5.0, thickness_units="screen", visible=False
             )
             for name in names
@@ -92,7 +92,7 @@ class Stage:
             pixels = np.stack([columns, rows], axis=1)
             depth = observation.depth[rows, columns]
             points = lift(pixels, depth, observation.intrinsics, observation.camera_pose)
-            self._points = self._scene.add_point_cloud(
+            self._points = self.scene.add_point_cloud(
                 "/seen", points, observation.rgb[rows, columns], point_size=POINT_M, precision="float32"
             )
 
@@ -102,7 +102,7 @@ class Stage:
             if self._bodies[name][0] == look:
                 return
             self._bodies.pop(name)[1].remove()
-        handle = self._scene.add_glb(f"/cell/{name.replace('/', '.') or 'world'}", drawing.glb(surfaces))
+        handle = self.scene.add_glb(f"/cell/{name.replace('/', '.') or 'world'}", drawing.glb(surfaces))
         self._bodies[name] = look, handle
         self._shown.pop(name, None)
 
