@@ -22,7 +22,7 @@ ROUGHNESS = 0.75
 TUBE_SIDES = 12
 TUBE_M = (0.003, 0.06)  # least and largest radius that is drawn
 DASH = 2  # steps of a dash, and of the gap behind it
-FOLLOWED, IGNORED = np.array([24, 118, 60]), np.array([222, 184, 135])  # colours of the weights 1 and 0
+FOLLOWED, IGNORED = np.array([0, 110, 60]), np.array([255, 244, 170])  # colours of the weights 1 and 0
 KEYPOINT_COLOURS = ("#e6194b", "#3cb44b", "#ffe119", "#4363d8", "#f58231", "#911eb4", "#42d4f4", "#f032e6")
 
 

@@ -33,6 +33,7 @@ WAYS = {  # key: way in the view of the browser (right, away, up), and turn abou
     "L": ((1, 0, 0), 0), "J": ((-1, 0, 0), 0), "I": ((0, 1, 0), 0), "K": ((0, -1, 0), 0),
     "U": ((0, 0, 1), 0), "O": ((0, 0, -1), 0), "N": ((0, 0, 0), 1), "M": ((0, 0, 0), -1),
 }  # fmt: skip
+GAMEPAD = Path(__file__).with_name("gamepad.js")
 HOW_TO = """
 1. **Drag the coloured handle** at the gripper: arrows shift, rings turn. Recording begins as you move.
 2. **Space** closes and opens the gripper.
@@ -90,6 +91,9 @@ class Page:
             llm,
         )
         self._bind_keys()
+        # Browsers run no script element that is added to a page, but the handler of an image that cannot be loaded.
+        script = html.escape(GAMEPAD.read_text())
+        self._gui.add_html(f'<img src="data:," alt="" style="display:none" onerror="{script}">')
 
     @property
     def folder(self) -> Path:
@@ -107,6 +111,7 @@ class Page:
         names = tuple(arm.name for arm in cell.arms)
         if names != self._grippers:
             self._grippers, self._arm, self._dragged = names, 0, None
+            self._count()
             self._stage.show_grippers(names)
             for index, gizmo in enumerate(self._stage.gizmos):
                 self._follow(gizmo, index)
@@ -181,7 +186,10 @@ class Page:
 
     def _count(self) -> None:
         kept = len(self.demonstrations)
-        self._kept.content = f"**{kept} demonstration{'' if kept == 1 else 's'} kept** in `{self.folder}` (aim: ten)"
+        words = f"**{kept} demonstration{'' if kept == 1 else 's'} kept** in `{self.folder}` (aim: ten)"
+        if len(self._grippers) > 1:
+            words += f"\n\nKeys move the **{self._grippers[self._arm]}** gripper; **C** changes to the other."
+        self._kept.content = words
 
     def _follow(self, gizmo: viser.TransformControlsHandle, arm: int) -> None:
         """Let the arm follow its handle."""
@@ -221,6 +229,7 @@ class Page:
 
     def _choose_arm(self) -> None:
         self._arm = (self._arm + 1) % max(len(self._grippers), 1)
+        self._count()
 
     def _nudge(self, way: tuple[int, int, int], turn: int, event: Any) -> None:
         """Shift or turn the gripper by one step, in the directions that the browser sees."""

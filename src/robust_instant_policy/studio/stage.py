@@ -17,7 +17,7 @@ from robust_instant_policy.studio.cell import Cell, Surface
 
 GIZMO_M = 0.2
 MOVED = 1e-4  # entries of a pose that change by less are not sent
-EYE, LOOK_AT = (-0.06, -1.1, 0.75), (-0.08, 0.0, 0.1)  # of a new browser, m
+EYE, LOOK_AT = (-0.02, -0.92, 0.62), (-0.06, 0.02, 0.12)  # of a new browser, m
 POINT_M = 0.003
 REFUSED = (214, 40, 57)
 
