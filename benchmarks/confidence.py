@@ -2,7 +2,7 @@
 
     python benchmarks/confidence.py run --out runs/confidence            # resumable; hours for all faults
     python benchmarks/confidence.py run --out runs/confidence --faults none shuffled:demos --tasks push-cube
-    python benchmarks/confidence.py fit runs/confidence                  # coefficients from the tuning rows
+    python benchmarks/confidence.py fit runs/confidence --relations runs/relations.jsonl    # coefficients, see `fit`
     python benchmarks/confidence.py report runs/confidence               # table and diagram from the others
 
 A row is what a user would see, refused while fitting or planning, or a plan with its confidence; and whether the plan
@@ -30,6 +30,7 @@ from unittest.mock import patch
 
 import numpy as np
 from faults import FAULTS, Fault
+from pick_and_place import WITHIN_M
 from rich.progress import track
 from scipy.optimize import minimize
 from stand_in import StandIn
@@ -52,6 +53,7 @@ HALLUCINATED = {"hallucinated-40%": 0.4, "hallucinated-60%": 0.6, "hallucinated-
 NUM_DEMOS = 10
 GATE = 0.9
 PRIOR_WEIGHT = 0.5  # of a coefficient's squared distance from 1, in units of the log-likelihood
+RELATIONS = "relations"
 NAMES = [field.name for field in fields(Evidence)]
 REFUSALS = (InvalidValueError, KeypointError, PlanningError)
 Row = dict[str, Any]
@@ -207,30 +209,42 @@ def is_noticed(row: Row) -> bool:
 def fit(options: argparse.Namespace) -> None:
     """Coefficients from the tuning rows: logistic regression, not negative, with a prior about 1.
 
-    The prior decides where rows do not: most faults are refused, so few plans are wrong. Each task is then left out.
+    The prior decides where rows do not: most faults are refused, so few plans are wrong. ``--relations`` are rows of
+    ``benchmarks/relations.py --confidence --split tune``; both kinds count alike, and have a constant each, of which
+    that of the simulated tasks is kept. Each task is then left out.
     """
-    rows = [row for row in executed(all_rows(options.folder, "tune")) if not row["evidence"]["errors"]]
-    rows = [row for row in rows if not is_noticed(row)]
-    rows = [row for row in rows if row["evidence"]["agreement"] >= GOOD_AGREEMENT]  # the other factor of the model
+    rows = [row for row in executed(all_rows(options.folder, "tune")) if not is_noticed(row)]
+    judged_rows = [(evidence_of(row), row["outcome"] == "success", row["task"]) for row in rows]
+    related = [row["outcome"] for row in read(options.relations) if row["case"]["split"] == "tune"]
+    judged_rows += [
+        (evidence_of(outcome), outcome["errors"][0] <= WITHIN_M, RELATIONS)
+        for outcome in related
+        if outcome["evidence"]
+    ]
+    # the other factors of the model are 0 or left as they are
+    known = [row for row in judged_rows if not row[0].errors and row[0].agreement >= GOOD_AGREEMENT]
     names = [name for name in COEFFICIENTS if name != "constant"]
-    found = [evidence_of(row).features() for row in rows]
-    features = np.array([[1.0, *(values[name] for name in names)] for values in found])
-    right = np.array([row["outcome"] == "success" for row in rows])
-    tasks = np.array([row["task"] for row in rows])
+    found = [evidence.features() for evidence, *_ in known]
+    features = np.array([[1.0, *(values[name] for name in names), 0.0] for values in found])
+    right, tasks = np.array([row[1] for row in known]), np.array([row[2] for row in known])
+    made_up = tasks == RELATIONS
+    features[made_up, -1] = 1.0
+    weight = np.where(made_up, (~made_up).sum() / max(made_up.sum(), 1), 1.0)
 
     def solve(chosen: np.ndarray) -> dict[str, float]:
         def loss(b: np.ndarray) -> float:
             score = features[chosen] @ b
-            likelihood = -np.logaddexp(0, np.where(right[chosen], -score, score)).sum()
-            return float(PRIOR_WEIGHT * ((b[1:] - 1) ** 2).sum() - likelihood)
+            likelihood = -(weight[chosen] * np.logaddexp(0, np.where(right[chosen], -score, score))).sum()
+            return float(PRIOR_WEIGHT * ((b[1:-1] - 1) ** 2).sum() - likelihood)
 
-        bounds = [(None, None)] + [(0, None)] * len(names)
-        best = minimize(loss, np.ones(len(names) + 1), bounds=bounds).x
-        return {name: round(float(b), 2) for name, b in zip(["constant", *names], best, strict=True)}
+        bounds = [(None, None), *[(0, None)] * len(names), (None, None)]
+        best = minimize(loss, np.ones(len(bounds)), bounds=bounds).x
+        return {name: round(float(b), 2) for name, b in zip(["constant", *names], best[:-1], strict=True)}
 
-    print(f"{len(rows)} plans, {right.mean():.1%} right")
-    print("COEFFICIENTS =", solve(np.ones(len(rows), dtype=bool)))
-    without = {task: solve(tasks != task) for task in sorted(set(tasks))}
+    print(f"{(~made_up).sum()} plans in simulated tasks, {right[~made_up].mean():.1%} right;", end=" ")
+    print(f"{made_up.sum()} in made-up scenes, {right[made_up].mean() if made_up.any() else 0:.1%} right")
+    print("COEFFICIENTS =", solve(np.ones(len(known), dtype=bool)))
+    without = {task: solve(tasks != task) for task in sorted(set(tasks) - {RELATIONS})}
     print("each task with the coefficients that the others give:")
     print(table({"all": all_rows(options.folder, "tune")}, without))
 
@@ -332,6 +346,7 @@ def main() -> None:
     running.set_defaults(run=run)
     fitting = commands.add_parser("fit")
     fitting.add_argument("folder", type=Path)
+    fitting.add_argument("--relations", type=Path, default=Path("-"), help="rows of benchmarks/relations.py")
     fitting.set_defaults(run=fit)
     reporting = commands.add_parser("report")
     reporting.add_argument("folder", type=Path)

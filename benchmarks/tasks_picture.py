@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image
 
-from robust_instant_policy.tasks import FAMILIES, make_task
+from robust_instant_policy.tasks import make_task
+from robust_instant_policy.tasks.families import FAMILIES
 from robust_instant_policy.trajectory import downsample
 
 SEED = 4
@@ -41,5 +42,5 @@ def square(picture: Image.Image) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    names = next(family.names for family in FAMILIES if family.package == sys.argv[1])
+    names = next(family.names for family in FAMILIES if family.module == f"{sys.argv[1]}.task")
     Image.fromarray(np.concatenate(columns(names), axis=1)).save(sys.argv[2], quality=85)

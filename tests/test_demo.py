@@ -37,7 +37,9 @@ def test_the_demo_succeeds_and_leaves_plan_video_and_report(run_folder):
         stage.name for stage in record.stages
     }
     assert sum(1 for _ in decode_video(run_folder / "execution.mp4")) > 20
-    assert record.outcome in (run_folder / "report.html").read_text()
+    page = (run_folder / "report.html").read_text()
+    assert record.outcome in page
+    assert "configuration: adaptive" in page
 
 
 def test_the_robust_gripper_is_as_rigid_as_the_one_that_was_shown(run_folder, workbench):

@@ -276,7 +276,7 @@ def test_code_that_decides_results_makes_other_rows_and_a_command_does_not(tmp_p
         return code_digest(copy)
 
     same = ("commands/eval.py", "reporting/tables.py", "evaluation/store.py")
-    deciding = ("policies/rip.py", "evaluation/rollout.py", "tasks/maniskill/ur5e_hande.urdf")
+    deciding = ("policies/rip.py", "evaluation/rollout.py", "motion/urdf/ur5e_hande.urdf")
     assert {digest_after(None), *map(digest_after, same)} == {code_digest()}
     assert len({code_digest(), *map(digest_after, deciding)}) == 1 + len(deciding)
 
@@ -723,3 +723,10 @@ def test_results_are_not_written_among_demonstrations(workbench, tmp_path, capsy
     assert main([command, *words, "--out", str(demonstrations)]) == 1
     assert "holds demonstrations" in capsys.readouterr().err
     assert sorted(demonstrations.rglob("*")) == before
+
+
+def test_a_tuning_seed_that_reaches_the_test_scenes_is_refused():
+    make_suites(["chosen"], Choice(Variant("rip"), ["push-cube"], ["rip"], seed=899, split="tune"))
+    with pytest.raises(RipError, match="--split tune"):
+        make_suites(["chosen"], Choice(Variant("rip"), ["push-cube"], ["rip"], seed=900, split="tune"))
+    make_suites(["chosen"], Choice(Variant("rip"), ["push-cube"], ["rip"], seed=10**30, split="test"))

@@ -105,10 +105,13 @@ def test_most_keypoints_are_on_what_the_hand_grasps():
 
 def test_more_pixels_do_not_lose_a_small_thing_and_a_smaller_one_is_told():
     large, small = (-0.1, 0.1, 0.05, 0.05, COLOURS[0]), (0.1, -0.1, 0.008, 0.02, COLOURS[1])
-    for size in (250, 330):
+    found = []
+    for size in (120, 250, 330, 640):
         blocks = [large, small]
         image = photograph(blocks, size=size)
         extractor = KeypointExtractor(features="efficientnet").fit([image])
-        on_small = 1 in owners(extractor.pixels_[0], image, blocks)
-        assert on_small or any("too small" in note for note in extractor.notes_)
-    assert on_small
+        found.append(1 in owners(extractor.pixels_[0], image, blocks))
+        assert found[-1] or any("too small" in note for note in extractor.notes_)
+    assert found == sorted(found)
+    assert found[0] is False
+    assert found[-1] is True

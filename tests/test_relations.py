@@ -21,6 +21,7 @@ from robust_instant_policy.policies import (
     locate,
     scene_of_keypoints,
 )
+from robust_instant_policy.sanity.envelope import step_turns
 
 ROOT = Path(__file__).parents[1]
 
@@ -59,6 +60,20 @@ def test_a_plan_needs_keypoints_only():
     assert key_error(plan.trajectory, new.path) <= WITHIN_M
     with pytest.raises(UsageError, match="keypoints of the demonstrations were given"):
         locate(context, None)
+
+
+def test_a_plan_turns_between_two_things_as_gradually_as_the_demonstrations():
+    draw = FAMILIES["flip"].scenes("tune", 0, 0.002)
+    shown = [draw(number) for number in range(10)]
+    context = context_of_keypoints(
+        np.stack([scene.keypoints for scene in shown]), [scene.path for scene in shown], Settings()
+    )
+    policy = Neighbours().fit_context(context)
+    demonstrated = max(step_turns(scene.trajectory).max() for scene in shown)
+    for number in range(1000, 1005):
+        plan = policy.plan_scene(scene_of_keypoints(draw(number, exact=True).keypoints))
+        assert step_turns(plan.trajectory).max() < 1.5 * demonstrated
+        assert plan.evidence["errors"] == 0
 
 
 def test_a_scene_between_two_ways_to_act_has_less_confidence_and_says_so():

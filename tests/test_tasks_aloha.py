@@ -94,7 +94,7 @@ def stay(task, seconds: float, command: np.ndarray | None = None) -> None:
 def test_what_was_grasped_does_not_slip(banana):
     attempt = banana.demonstrate(SEED)
     cell = banana._cell
-    command = cell._joints()
+    command = cell.measured()
     command[-1] = 0.0
     held = invert_pose(cell.tool_poses()[0]) @ cell.middle()
     stay(banana, HOLD_SECONDS, command)

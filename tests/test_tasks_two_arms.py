@@ -48,7 +48,7 @@ def test_both_hands_work_at_the_same_time_and_are_named_in_the_order_of_the_colu
 def test_a_held_pan_does_not_slip(task):
     assert task.demonstrate(SEED).success
     cell = task._cell
-    command = cell._joints()
+    command = cell.measured()
     command[[6, 13]] = 0.0
     held = invert_pose(cell.tool_poses()[1]) @ cell.pose_of("dustpan")
     stay(task, HOLD_SECONDS, command)

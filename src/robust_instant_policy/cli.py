@@ -15,9 +15,11 @@ from robust_instant_policy.errors import RipError
 # Each command is a module in `commands`. Only the one that runs is imported, because others may need more packages.
 COMMANDS = {
     "demo": "record demonstrations, plan in a new scene, execute, and write a report",
+    "new-task": "write the template of a task of your own, or check one",
     "record": "record demonstrations into a dataset folder",
     "check": "check demonstrations, and a new scene, against each other, and name likely mistakes",
     "plan": "plan for one observation and write plan.json; nothing is executed",
+    "serve": "plan for robots that ask over openpi's websocket protocol or HTTP",
     "eval": "run the paper's evaluation, or a part of it; continues an interrupted run",
     "train": "train dp or kat-dp on demonstrations; continues an interrupted training",
     "report": "write the report of a run, or of an evaluation, again",
@@ -26,6 +28,9 @@ COMMANDS = {
     "keypoints": "write a page with the keypoints of demonstrations and new scenes, and their errors",
     "samples": "count or export the stored answers of a language model",
     "studio": "open a page in the browser to demonstrate by hand, look at plans, and execute them",
+    "robot": "check the devices of a real cell, or emulate one",
+    "run": "plan for what the cell's camera sees, and execute the plan on its arms",
+    "calibrate": "calibrate the camera, a gripper or a leader arm of a real cell",
     "doctor": "check this machine, and say how to install what is missing",
 }
 
@@ -77,7 +82,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         command = commands.add_parser(name, help=summary, description=summary)
         command.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
         if name == chosen:
-            module = importlib.import_module(f"robust_instant_policy.commands.{name}")
+            module = importlib.import_module(f"robust_instant_policy.commands.{name.replace('-', '_')}")
             module.add_arguments(command)
             command.set_defaults(run=module.run)
     return parser.parse_args(arguments)

@@ -44,6 +44,14 @@ def install_command(extra: str) -> str:
     return f"{command} && pip install --no-deps {simulator}" if simulator and sys.version_info >= (3, 13) else command
 
 
+class MissingMethodError(UsageError):
+    """A task of one's own that lacks an optional method."""
+
+    def __init__(self, task: str, method: str, purpose: str):
+        super().__init__(f"the task {task} has no {method}(), which is needed {purpose} (docs/own-tasks.md)")
+        self.task, self.method = task, method
+
+
 class InvalidValueError(RipError, ValueError):
     """An array or number that breaks its contract; names the argument and its shape."""
 
@@ -74,3 +82,19 @@ class RendererError(RipError):
 
 class UnreachableError(RipError):
     """A trajectory that the arm must not or cannot follow."""
+
+
+class CellError(RipError):
+    """The file of a cell is missing or wrong; names the file and the key."""
+
+
+class RobotError(RipError):
+    """An arm, a leader or a camera that is missing, faulty or does not answer."""
+
+
+class StoppedError(RobotError):
+    """A motion was stopped: the arms hold their position; says what was wrong and what to do."""
+
+
+class CalibrationError(RipError):
+    """A calibration that the measurements do not determine or contradict; names the likely mistake."""

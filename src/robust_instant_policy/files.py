@@ -165,3 +165,12 @@ def _sync_folder(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def file_stem(task: str) -> str:
+    """The name of a task in names of files and folders: without ``/`` and ``:``.
+
+    >>> file_stem("metaworld/reach"), file_stem("my_tasks:Pour")
+    ('metaworld-reach', 'my_tasks-Pour')
+    """
+    return task.replace("/", "-").replace(":", "-")

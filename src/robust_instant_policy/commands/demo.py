@@ -13,7 +13,8 @@ from robust_instant_policy.commands.options import DATA, RUNS, add_method, metho
 from robust_instant_policy.datasets import VideoWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import UnreachableError, UsageError
-from robust_instant_policy.evaluation import holds_results, obtain_demonstrations, scene_seed
+from robust_instant_policy.evaluation import Variant, holds_results, obtain_demonstrations, scene_seed
+from robust_instant_policy.files import file_stem
 from robust_instant_policy.llm import DEADLINE_S, connect
 from robust_instant_policy.policies import RobustInstantPolicy, Settings
 from robust_instant_policy.reporting.run import (
@@ -49,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     if options.demos.isdecimal() and int(options.demos) == 0:
         raise UsageError("--demos 0: the task must be shown at least once")
-    out = options.out or RUNS / f"{options.task}-{options.seed}"
+    out = options.out or RUNS / f"{file_stem(options.task)}-{options.seed}"
     settings = method_settings(options)
     run_demo(options.task, options.llm, options.seed, options.demos, out, DATA, settings, options.deadline)
     return 0
@@ -140,6 +141,7 @@ def _run(
         seed=scene,
         llm=model.name,
         method=policy.name,
+        config=Variant.of(policy.settings, policy.name).config,
         success=success,
         outcome=outcome,
         stages=tuple(stages),
@@ -164,7 +166,8 @@ def _demonstrations(task: Task, wanted: str, data: Path, screen: StageConsole) -
         thrown_away = thrown
         screen.done_so_far("recording demonstrations", there, count)
 
+    folder = data / file_stem(task.name)
     with screen.stage(f"{wanted} demonstrations"):
-        shown = obtain_demonstrations(task, data / task.name, int(wanted), progress)
-    screen.say(f"    in {data / task.name}; {thrown_away} failed attempts discarded")
+        shown = obtain_demonstrations(task, folder, int(wanted), progress)
+    screen.say(f"    in {folder}; {thrown_away} failed attempts discarded")
     return shown

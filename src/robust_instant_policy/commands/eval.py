@@ -109,21 +109,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     first_demonstration_seed(options.sets - 1)  # refuses more sets than there are before anything is recorded
-    settings = method_settings(options)
-    base = Variant(
-        "rip",
-        demos=options.demos,
-        queries=options.queries,
-        downsampling=settings.downsampling,
-        frames=settings.frames,
-        layout=settings.layout,
-        features=settings.features,
-        model=model_name(options.llm),
-        keypoints=settings.keypoints,
-        column=settings.column,
-        estimator=settings.estimator,
+    base = Variant.of(
+        method_settings(options), demos=options.demos, queries=options.queries, model=model_name(options.llm)
     )
-    steps = options.steps or DEFAULT_STEPS
     choice = Choice(
         base,
         options.tasks,
@@ -134,7 +122,7 @@ def run(options: argparse.Namespace) -> int:
         options.assets,
         options.level,
         options.split,
-        steps,
+        options.steps or DEFAULT_STEPS,
     )
     setups = [
         Setup(

@@ -20,9 +20,10 @@ from robust_instant_policy.files import write_whole
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.perception.accuracy import Accuracy, measure
 from robust_instant_policy.reporting.keypoints import keypoints_page
-from robust_instant_policy.tasks import TASK_NAMES, make_task
+from robust_instant_policy.tasks import is_installed, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 from robust_instant_policy.tasks.level import PAPER
+from robust_instant_policy.tasks.task import require
 
 SAME_DEPTH_M = 0.005  # difference of depth between two renderings of one scene
 OTHER_PIXELS = 0.002  # share of pixels that differ by more, from which two images show different scenes
@@ -32,6 +33,9 @@ Camera = Callable[[Observation, int], Observation]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
+    parser.add_argument(
+        "--task", help="task that the demonstrations are of, if it is not installed: module:Class (default: their own)"
+    )
     parser.add_argument("--scenes", type=positive, default=20, metavar="N", help="new scenes (default: %(default)s)")
     parser.add_argument("--seed", type=seed, default=0, help="seed of the first new scene (default: %(default)s)")
     add_keypoints(parser, "auto", "registration")
@@ -44,7 +48,9 @@ def run(options: argparse.Namespace) -> int:
     out = options.out or beside(options.demos, "-keypoints.html")
     features, correspondence = options.features or "auto", options.keypoints or "registration"
     extractor = partial(KeypointExtractor, features=features, correspondence=correspondence)
-    show_keypoints(options.demos, extractor, options.scenes, options.noise, options.seed, out, options.level)
+    show_keypoints(
+        options.demos, extractor, options.scenes, options.noise, options.seed, out, options.level, options.task
+    )
     return 0
 
 
@@ -56,24 +62,29 @@ def show_keypoints(
     seed: int,
     out: Path,
     level: str = PAPER.name,
+    task_name: str | None = None,
 ) -> Path:
-    """Write the page to ``out``. For a simulated task, also compare the keypoints of new scenes with the true positions
-    of the same material points; ``level`` is that of these scenes and of the demonstrations. ``noisy`` adds the depth
-    camera's noise to all images.
+    """Write the page to ``out``.
+
+    For a simulated task (``task_name``, or that of the demonstrations), also compare the keypoints of new scenes with
+    the true positions of the same material points; ``level`` is that of these scenes and of the demonstrations.
+    ``noisy`` adds the depth camera's noise to all images.
     """
     screen = StageConsole()
     demonstrations = load_demonstrations(demos)
     camera: Camera = CameraNoise().photograph if noisy else lambda seen, _: seen
     images = [camera(one.observation, NOISE_SEED + index) for index, one in enumerate(demonstrations)]
     trajectories = [one.trajectory for one in demonstrations]  # they decide where a policy's keypoints lie, too
-    name = demonstrations[0].task
-    simulated = name in TASK_NAMES and all(one.seed is not None for one in demonstrations)
+    name = task_name or demonstrations[0].task
+    # a class of one's own is loaded where the user names it, never where a dataset does
+    simulated = (task_name or is_installed(name)) and all(one.seed is not None for one in demonstrations)
     extractor = make_extractor()
     scenes: list[Observation] = []
     accuracy = None
     if simulated:
         task: Any = make_task(name, level=level)
         try:
+            require(task, "scene_truth")
             extractor = make_extractor(workspace=task.workspace)
             with screen.stage(f"keypoints of {len(images)} demonstrations"):
                 extractor.fit(images, trajectories)

@@ -89,8 +89,7 @@ def add_keypoints(parser: argparse.ArgumentParser, features: str, correspondence
     parser.add_argument("--features", help=f"image descriptors (default: {features})")
     parser.add_argument(
         "--keypoints",
-        choices=WORDS["keypoints"],
-        help="keypoints by registration of objects, or by nearest descriptors as in the paper "
+        help="registration of objects, nearest descriptors as in the paper, or module:Class for a source of your own "
         f"(default: {correspondence})",
     )
 

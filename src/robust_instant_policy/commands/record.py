@@ -1,4 +1,4 @@
-"""`rip record`: record demonstrations of a simulated task into a dataset folder."""
+"""`rip record`: record demonstrations into a dataset folder, of a simulated task or on the arms of a real cell."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from robust_instant_policy.tasks.record import record
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--task", required=True, help="name of the task")
+    parser.add_argument("--task", required=True, help="name of the task; with --robot, any name")
+    parser.add_argument("--robot", type=Path, metavar="FILE", help="file of a cell, to record with its leaders")
+    parser.add_argument("--description", default="", help="with --robot: the task in words")
     parser.add_argument("--episodes", type=positive, default=10, help="demonstrations (default: %(default)s)")
     parser.add_argument(
         "--seed", type=seed, default=0, help="seed of the first scene of a new folder (default: %(default)s)"
@@ -29,6 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    if options.robot is not None:
+        from robust_instant_policy.commands.record_cell import record_cell  # needs the packages of real arms
+
+        return record_cell(options)
     screen = StageConsole()
     task = make_task(options.task, assets=options.assets, level=options.level)
     try:

@@ -13,10 +13,11 @@ from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception.network import resolve_features
+from robust_instant_policy.plugins import is_own
 from robust_instant_policy.policies import TRAINED_METHODS, Settings, make_trained_policy
 from robust_instant_policy.policies.training import DEFAULT_STEPS, Training
 from robust_instant_policy.reporting.training import training_picture
-from robust_instant_policy.tasks import TASK_NAMES, make_task
+from robust_instant_policy.tasks import is_installed, make_task
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,8 +67,8 @@ def train(task: str, method: str, demos: Path, limit: int | None, training: Trai
 
 
 def _workspace(task: str) -> FloatArray | None:
-    """Workspace of the task, so that keypoints are those of the evaluation; None for your own tasks."""
-    if task not in TASK_NAMES:
+    """Workspace of the task, so that keypoints are those of the evaluation; None for one without a simulator."""
+    if not (is_installed(task) or is_own(task)):
         return None
     simulated = make_task(task)
     try:

@@ -11,6 +11,7 @@ import numpy as np
 from robust_instant_policy.context.choice import choose_frames
 from robust_instant_policy.context.codec import MM
 from robust_instant_policy.context.frames import WORLD_FRAME, Frame
+from robust_instant_policy.context.joins import joined, shown_jumps
 from robust_instant_policy.context.things import WORLD, Thing, locate
 from robust_instant_policy.context.ways import Ranking
 from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
@@ -22,11 +23,13 @@ class StepFrames:
     """``arms[a][t]`` is the frame in which step t of arm a is written.
 
     The numbers of a step are, for each arm: the point between the fingertips, then the gripper point and the first
-    fingertip relative to it (millimetres, in the step's frame), and the gripper state.
+    fingertip relative to it (millimetres, in the step's frame), and the gripper state. ``jumps`` are those of each arm
+    that were demonstrated (`shown_jumps`); none are needed where no frame changes.
     """
 
     arms: tuple[tuple[Frame, ...], ...]
     ranking: Ranking | None = None
+    jumps: tuple[FloatArray, ...] = ()
 
     @classmethod
     def world(cls, num_steps: int, num_arms: int) -> StepFrames:
@@ -44,8 +47,9 @@ class StepFrames:
         """The frames in which demonstrations with ``keypoints (I, K, 3)``, named by ``ranking``, and aligned ``actions
         (I, T, 10·A)`` predict each other best; ``key_steps`` count more (see `choose_frames`)."""
         scene, hands = locate([WORLD, *things], keypoints), hands_of(actions)
-        frames = (choose_frames(things, scene, hands[:, :, arm], key_steps) for arm in range(hands.shape[2]))
-        return cls(tuple(map(tuple, frames)), ranking)
+        arms = [hands[:, :, arm] for arm in range(hands.shape[2])]
+        frames = tuple(tuple(choose_frames(things, scene, own, key_steps)) for own in arms)
+        return cls(frames, ranking, tuple(map(shown_jumps, arms)))
 
     @property
     def num_arms(self) -> int:
@@ -106,11 +110,22 @@ class StepFrames:
         return rows.reshape(len(actions), -1)
 
     def decode(self, keypoints: FloatArray, numbers: FloatArray) -> FloatArray:
-        """The inverse of `encode`, for the first ``len(numbers)`` steps."""
+        """The actions ``(T', 10·A)`` that the first T' steps' ``numbers`` mean in the scene of ``keypoints (K, 3)``.
+
+        The inverse of `encode`, but without the jumps where frames change (`joins`).
+        """
         rows = numbers.reshape(len(numbers), self.num_arms, ACTION_DIM).copy()
         for poses, row in zip(self.poses(keypoints), rows, strict=False):
             for pose, arm in zip(poses, row, strict=True):
                 arm[:STATE_INDEX] = transform_points(pose, _points(arm / MM)).ravel()
+        states = rows[..., STATE_INDEX] > 0.5
+        switches = np.flatnonzero((states[1:] != states[:-1]).any(axis=1))
+        key_steps = {0, len(rows) - 1, *switches, *(switches + 1)}
+        for arm, (own, shown) in enumerate(zip(self.arms, self.jumps, strict=False)):
+            if changes := [step for step in range(1, len(rows)) if not own[step].continues(own[step - 1])]:
+                errors = np.array([frame.error for frame in own[: len(rows)]])
+                hands = joined(hands_of(rows[:, arm])[:, 0], errors, key_steps, changes, shown[: len(rows) - 1])
+                rows[:, arm, :STATE_INDEX] = hands.reshape(len(rows), STATE_INDEX)
         return rows.reshape(len(numbers), -1)
 
     def variation(self, numbers: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ from typing import Any, cast
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import MissingExtraError, UsageError
+from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.work import Outcome, SceneWork, Setup
 from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.evaluation.workers import ONE_THREAD, Died, Finished, Message, Worker, WorkError, run_pool
@@ -151,4 +152,5 @@ def _most_demonstrations(setup: Setup, works: list[SceneWork]) -> dict[str, list
     most: dict[str, int] = {}
     for work in works:
         most[work.scene.task] = max(most.get(work.scene.task, 0), work.demos)
-    return {task: load_demonstrations(setup.data / task, task=task, limit=count) for task, count in most.items()}
+    folders = {task: demonstrations_folder(setup.data, task, with_images=False) for task in most}
+    return {task: load_demonstrations(folders[task], task=task, limit=count) for task, count in most.items()}

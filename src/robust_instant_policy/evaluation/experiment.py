@@ -27,9 +27,10 @@ from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.evaluation.work import Outcome, Planned, SceneWork, Setup, Workers
 from robust_instant_policy.evaluation.workbench import Workbench
-from robust_instant_policy.files import lock_folder, make_folder, write_whole
+from robust_instant_policy.files import file_stem, lock_folder, make_folder, write_whole
 from robust_instant_policy.llm import model_name
-from robust_instant_policy.perception.network import resolve_features
+from robust_instant_policy.perception.network import choose_network, resolve_features
+from robust_instant_policy.perception.settings import PAPER_SIMULATION
 from robust_instant_policy.policies import IMAGE_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.tasks import make_task
@@ -167,7 +168,7 @@ def plan_file(scene: Scene, variant: Variant) -> str:
 
 def training_file(task: str, variant: Variant) -> str:
     """Path in a run's folder of the figure about the training of ``variant`` on ``task``."""
-    return f"{TRAINING_FOLDER}/{task}-{variant.file_name}.svg"
+    return f"{TRAINING_FOLDER}/{file_stem(task)}-{variant.file_name}.svg"
 
 
 def missing_work(
@@ -238,6 +239,8 @@ def _with_demonstrations(
         shown = stored_demonstrations(folder, task, count)
         of_task = [trial for trial in trials if trial[0].task == task]
         if len(shown) < count and not all(plain(trial) in done for trial in of_task):
+            for features in {variant.features for _, variant in of_task if variant.method != "dp"}:
+                choose_network(features, PAPER_SIMULATION)  # missing weights are told before anything is recorded
             shown = _record(of_task[0][0], setup.demo_set, folder, count, with_images, progress)
         digests[task, with_images] = demonstration_digests(shown)
 

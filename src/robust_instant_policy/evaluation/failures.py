@@ -8,13 +8,16 @@ it is due to:
 - *regression*: one of the candidates that were aggregated succeeds by itself;
 - *samples*: none of them does, or the trajectory that failed is a single sample, not aggregated.
 
-A closed-loop policy has no such stages; beyond the execution, its failures are its own (*policy*).
+A closed-loop policy has no such stages; beyond the execution, its failures are its own (*policy*). A task of one's own
+may have no demonstrator or no ground truth: a check that needs them is left out, and a failure that only the ground
+truth could attribute is *unknown*.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -24,14 +27,14 @@ from robust_instant_policy.errors import KeypointError, PlanningError
 from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey
 from robust_instant_policy.evaluation.rollout import ScenePolicy, execute
 from robust_instant_policy.evaluation.variant import Scene, Variant
-from robust_instant_policy.perception import Located
+from robust_instant_policy.perception import KeypointExtractor, Located
 from robust_instant_policy.perception.accuracy import KnownScene, measure
 from robust_instant_policy.policies import ClosedLoopPolicy, Context, LocatedScene, Stage
-from robust_instant_policy.tasks.task import FrameSink, Task
+from robust_instant_policy.tasks.task import FrameSink, Task, offers
 from robust_instant_policy.trajectory import Trajectory, downsample
 
 VIDEO_FOLDER = "videos"
-STAGES = ("keypoints", "samples", "regression", "execution", "policy")
+STAGES = ("keypoints", "samples", "regression", "execution", "policy", "unknown")
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class Failure:
     variant: Variant
     candidate: int
     stage: str
-    demonstrator: bool
+    demonstrator: bool | None
     true_keypoints: bool | None
     keypoint_error: float | None
     good_candidate: bool | None
@@ -78,12 +81,14 @@ def true_keypoints(task: Task, seed: int, context: Context, shown_truth: Sequenc
 
     ``shown_truth`` is the simulator's knowledge of the demonstrations' own scenes.
     """
-    if context.extractor is None:  # the keypoints were given
+    if context.extractor is None or not offers(task, "scene_truth"):
         return None
     observation = task.reset(seed)
     images = [demonstration.observation for demonstration in context.demonstrations]
     try:
-        accuracy = measure(context.extractor, images, shown_truth, [observation], [task.scene_truth()])
+        accuracy = measure(
+            cast(KeypointExtractor, context.extractor), images, shown_truth, [observation], [task.scene_truth()]
+        )
     except KeypointError:
         return None
     found, truth = accuracy.located[0], accuracy.truth[0]
@@ -111,14 +116,15 @@ class FailureAnalysis:
 
         Raises `ModelError` where samples are missing that the method would need with the true keypoints.
         """
-        found = Failure(episode.scene, episode.variant, episode.candidate, "policy", True, None, None, None)
-        if not self._demonstrator_succeeds(episode.variant.downsampling):
-            return replace(found, stage="execution", demonstrator=False)
+        shown = self._demonstrator_succeeds(episode.variant.downsampling)
+        found = Failure(episode.scene, episode.variant, episode.candidate, "policy", shown, None, None, None)
+        if shown is False:
+            return replace(found, stage="execution")
         if isinstance(policy, ClosedLoopPolicy):
             return found
         known = truth()
         if known is None:
-            return replace(found, stage="keypoints")
+            return replace(found, stage="keypoints" if offers(self._task, "scene_truth") else "unknown")
         self._task.reset(self._scene.seed)
         better = self._succeeds_with(known.located, policy, episode.candidate)
         found = replace(found, true_keypoints=better, keypoint_error=known.error)
@@ -133,7 +139,9 @@ class FailureAnalysis:
         good = any(self._plays(candidate) for candidate in plan.candidates)
         return replace(found, stage="regression" if good else "samples", good_candidate=good)
 
-    def _demonstrator_succeeds(self, downsampling: str) -> bool:
+    def _demonstrator_succeeds(self, downsampling: str) -> bool | None:
+        if not offers(self._task, "demonstrate"):
+            return None
         if downsampling not in self._replayed:
             shown = self._task.demonstrate(self._scene.seed).demonstration.trajectory
             self._task.reset(self._scene.seed)

@@ -18,7 +18,7 @@ from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import ClosedLoopPolicy, LocatedScene, Plan
 from robust_instant_policy.sanity import GeometryError
-from robust_instant_policy.tasks.task import Execution, FrameSink, Task
+from robust_instant_policy.tasks.task import Execution, FrameSink, Task, require
 from robust_instant_policy.trajectory import Trajectory
 
 
@@ -89,6 +89,7 @@ def execute(task: Task, trajectory: Trajectory, on_frame: FrameSink | None = Non
 
 
 def _follow(task: Task, policy: ClosedLoopPolicy, observation: Observation, row: partial[Episode]) -> Episode:
+    require(task, "follow")
     start = time.perf_counter()
     controller = _Timed(policy.controller(observation))
     execution = task.follow(controller, policy.max_seconds)

@@ -11,6 +11,7 @@ import numpy as np
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import NoDemonstrationsError, UsageError
+from robust_instant_policy.files import file_stem
 from robust_instant_policy.tasks.record import record
 from robust_instant_policy.tasks.task import Task, bounded_seed
 
@@ -41,7 +42,7 @@ def first_demonstration_seed(demo_set: int) -> int:
 
 def demonstrations_folder(data: Path, task: str, with_images: bool) -> Path:
     """Folder in ``data`` of the demonstrations of ``task``; those with images have a lower rate."""
-    return data / (f"{task}-images" if with_images else task)
+    return data / (file_stem(task) + ("-images" if with_images else ""))
 
 
 def stored_demonstrations(folder: Path, task: str, count: int) -> list[Demonstration]:

@@ -11,9 +11,10 @@ from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.evaluation.paper import TABLE1_TASKS
 from robust_instant_policy.evaluation.scenes import scene_seed, split_of
 from robust_instant_policy.evaluation.variant import Scene, Variant, configs, require_no_path
+from robust_instant_policy.files import file_stem
 from robust_instant_policy.policies import METHOD_NAMES
 from robust_instant_policy.policies.training import DEFAULT_STEPS
-from robust_instant_policy.tasks import TASK_NAMES, UNSEEN_TASKS
+from robust_instant_policy.tasks import UNSEEN_TASKS, require_task
 from robust_instant_policy.tasks.level import make_level
 
 SIMULATION_TASKS = TABLE1_TASKS[:5]
@@ -46,13 +47,10 @@ class Suite:
 
     def __post_init__(self) -> None:
         require_no_path(self.name, self.objects, self.assets, self.level)
-        for kind, names, known in (
-            ("task", self.tasks, TASK_NAMES),
-            ("method", [variant.method for variant in self.variants], METHOD_NAMES),
-        ):
-            for name in names:
-                if name not in known:
-                    raise UnknownNameError(kind, name, known)
+        require_no_path(*map(file_stem, self.tasks))
+        for variant in self.variants:
+            if variant.method not in METHOD_NAMES:
+                raise UnknownNameError("method", variant.method, METHOD_NAMES)
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> Suite:
@@ -133,9 +131,16 @@ class Choice:
 
 
 def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:
-    """The analyses called ``names``, of which "all" stands for every one; raises `UnknownNameError` for others."""
+    """The analyses called ``names``, of which "all" stands for every one.
+
+    Raises `UnknownNameError` for others, and `UsageError` for scenes of a seed that do not lie in the chosen split.
+    """
+    for task in choice.tasks or ():
+        require_task(task)
     wanted = [one for name in names for one in (SUITE_NAMES if name == "all" else (name,))]
     seeds = tuple(scene_seed(choice.seed, index, choice.split) for index in range(choice.num_scenes))
+    if any(split_of(seed) != choice.split for seed in seeds):
+        raise UsageError(f"--seed {choice.seed} is too large for --split {choice.split}: its scenes are those of tests")
     objects = choice.objects or make_level(choice.level).objects
     suites = []
     for name in dict.fromkeys(wanted):

@@ -6,8 +6,10 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from robust_instant_policy.errors import InvalidValueError
+from robust_instant_policy.files import file_stem
 from robust_instant_policy.policies import (
     ASKING_METHODS,
     CONFIGS,
@@ -16,6 +18,7 @@ from robust_instant_policy.policies import (
     REGRESSING_METHODS,
     TRAINED_METHODS,
 )
+from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.regression import DEFAULT_DOF
 
@@ -56,6 +59,12 @@ class Variant:
     column: str = "auto"
     estimator: str = "em"
     config: str = ""
+
+    @classmethod
+    def of(cls, settings: Settings, method: str = "rip", **others: Any) -> Variant:
+        """``method`` with those of the ``settings`` that decide a row; ``others`` are fields of a variant."""
+        names = ("downsampling", "frames", "layout", "features", "keypoints", "column", "estimator")
+        return cls(method, **{name: getattr(settings, name) for name in names}, **others)
 
     def __post_init__(self) -> None:
         changed: dict[str, str | float | None] = {}
@@ -189,10 +198,13 @@ def by_demos(variants: Sequence[Variant]) -> dict[str, dict[int, Variant]]:
 
 
 def require_no_path(*names: str) -> None:
-    """Raises `InvalidValueError` for one with a slash: files are named after ``names``, also those that a run's folder
-    from elsewhere holds, and must stay inside of the folder that they are written to."""
+    """Raises `InvalidValueError` for one with a slash or two dots.
+
+    Files are named after ``names``, also those that a run's folder from elsewhere holds, and must stay inside of the
+    folder that they are written to.
+    """
     for name in names:
-        if not isinstance(name, str) or "/" in name or "\0" in name:
+        if not isinstance(name, str) or "/" in name or ".." in name or "\0" in name:
             raise InvalidValueError(f"{name!r} leads to another folder; names of tasks, suites and objects do not")
 
 
@@ -211,8 +223,8 @@ class Scene:
     level: str = "paper"
 
     def __post_init__(self) -> None:
-        require_no_path(self.task, self.objects, self.assets, self.level)
+        require_no_path(file_stem(self.task), self.objects, self.assets, self.level)
 
     def __str__(self) -> str:
         unusual = [value for value, usual in ((self.assets, "code"), (self.level, "paper")) if value != usual]
-        return "-".join((self.task, self.objects, str(self.seed), *unusual))
+        return "-".join((file_stem(self.task), self.objects, str(self.seed), *unusual))

@@ -39,7 +39,7 @@ from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.scene_truth import SceneTruth
-from robust_instant_policy.tasks.task import Task
+from robust_instant_policy.tasks.task import Task, offers
 from robust_instant_policy.trajectory import Trajectory
 
 if TYPE_CHECKING:  # it needs the extra "train"
@@ -214,7 +214,10 @@ class Workbench:
             yield Analysis(failure, film(task, policy, observation, episode.candidate) if self._setup.films else b"")
 
     def _truth_of_demonstrations(self, demos: int) -> list[SceneTruth] | None:
-        """The true scene of each demonstration; None if the seed of one of them is unknown."""
+        """The true scene of each demonstration; None if the seed of one of them, or the task's truth, is unknown."""
+        assert self._task is not None
+        if not offers(self._task, "scene_truth"):
+            return None
         shown = self._shown[:demos]
         seeds = [demonstration.seed for demonstration in shown if demonstration.seed is not None]
         if len(seeds) < len(shown):
@@ -223,7 +226,6 @@ class Workbench:
             name, objects, assets, level = self._place
             apart = None if objects == "seen" else make_task(name, assets=assets, level=level)
             task = apart or self._task
-            assert task is not None
             try:
                 for seed in seeds[len(self._shown_truth) :]:
                     task.reset(seed)

@@ -17,7 +17,8 @@ class Arm:
 
     ``name`` as the task calls it; ``home (J,)`` joint angles in rad; ``finger_travel`` of each finger from closed (0)
     to open, in metres, and ``finger_speed``, m/s; ``joint_speed`` rad/s and ``tool_speed`` m/s are limits;
-    ``turn_tolerance``, rad, is the largest accepted orientation error of the tool.
+    ``turn_tolerance``, rad, is the largest accepted orientation error of the tool; ``joint_acceleration`` rad/s² is
+    a limit of real arms.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Arm:
     joint_speed: float
     tool_speed: float
     turn_tolerance: float
+    joint_acceleration: float = np.inf
 
     @property
     def home_pose(self) -> FloatArray:

@@ -48,6 +48,7 @@ class Kinematics:
         posture_cost: float = 0.0,
         orientation_cost: float = ORIENTATION_COST,
     ):
+        self.model, self.base = model, np.asarray(base, dtype=np.float64)
         self._configuration = mink.Configuration(model)
         self._tool, self._kind, self.num_joints = tool, kind, num_joints
         self._task = mink.FrameTask(
@@ -56,25 +57,29 @@ class Kinematics:
         self._posture = mink.PostureTask(model, cost=posture_cost)
         self._tasks = [self._task, self._posture] if posture_cost else [self._task]
         self._limits = [mink.ConfigurationLimit(model)]
-        self._base = np.asarray(base, dtype=np.float64)
+
+    @property
+    def joint_range(self) -> FloatArray:
+        """Lowest and highest angle ``(J, 2)`` of each joint, rad."""
+        return self.model.jnt_range[: self.num_joints].copy()
 
     def tool_pose(self, joints: ArrayLike) -> FloatArray:
         """Tool pose ``(4, 4)`` in the world at ``joints (J,)``."""
         self._place(joints)
-        return self._base @ self._configuration.get_transform_frame_to_world(self._tool, self._kind).as_matrix()
+        return self.base @ self._configuration.get_transform_frame_to_world(self._tool, self._kind).as_matrix()
 
     def body_poses(self, joints: ArrayLike) -> dict[str, FloatArray]:
         """Pose ``(4, 4)`` in the world of each body of the model, by name, at ``joints (J,)``."""
         self._place(joints)
         data, model = self._configuration.data, self._configuration.model
         poses = {model.body(i).name: make_pose(data.xmat[i].reshape(3, 3), data.xpos[i]) for i in range(1, model.nbody)}
-        return {name: self._base @ pose for name, pose in poses.items()}
+        return {name: self.base @ pose for name, pose in poses.items()}
 
     def follow(self, poses: ArrayLike, start: ArrayLike) -> JointPath:
         """Joint angles along tool ``poses (N, 4, 4)``, each solved from the previous one, the first from ``start``."""
         poses = np.asarray(poses, dtype=np.float64)
         self._place(start)
-        local = invert_pose(self._base) @ poses
+        local = invert_pose(self.base) @ poses
         joints = np.empty((len(poses), self.num_joints))
         errors = np.empty((len(poses), 2))
         for step, pose in enumerate(local):

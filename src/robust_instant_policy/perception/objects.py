@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,11 +22,12 @@ from robust_instant_policy.perception.registration import (
     settle_turn,
     vote_for_motions,
 )
-from robust_instant_policy.perception.view import MIN_FOREGROUND_POINTS, UNRELATED, View, subsample
+from robust_instant_policy.perception.view import MIN_OBJECT_M2, TARGET_M, UNRELATED, View, subsample
 
 MAX_TEMPLATE_POINTS = 250
 MAX_TEMPLATE_CELLS = 80
 SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of other points of the object
+MIN_TARGET_POINTS = round(MIN_OBJECT_M2 / TARGET_M**2)
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
 RIVAL_SCALE = 0.01  # of the score by which a motion is worse, for a weight of 1/e
@@ -137,7 +138,7 @@ def find_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
     A piece of the first view is one object, or several if parts of it move differently in the other views.
     """
     home = views[0]
-    pieces = [piece for piece in home.pieces if len(piece) >= MIN_FOREGROUND_POINTS]
+    pieces = list(home.pieces)
     models = [Model((_template_of(home, piece, seed),)) for piece in pieces]
     found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
     number = 0
@@ -313,24 +314,31 @@ def register_all(models: Sequence[Model], view: View) -> list[Registration]:
     """Find all objects in ``view``, so that no two explain the same points of it.
 
     Each is registered on its own, a part near its object. From the best one on, an object that explains points of
-    better ones is registered again without those.
+    better ones is registered again without those, or the one that has them is, whichever explains the image better.
     """
     found: dict[int, Registration] = {}
     for i in sorted(range(len(models)), key=lambda i: models[i].parent >= 0):  # parts come after their objects
         found[i] = _register_model(models[i], view, found)
     tree = cKDTree(view.target[:, :3])
-    taken = np.zeros(len(view.target), dtype=bool)
-    settled: list[int] = []
-    for i in sorted(range(len(models)), key=lambda i: -found[i].score):
-        if _shared(tree, taken, models[i], found[i]) > (MAX_SHARED if models[i].parent < 0 else MAX_SHARED_BY_PART):
-            again = _register_model(models[i], view, found, _explained(models, found, settled))
-            options = [
-                replace(one, fitness=one.fitness * (1 - _shared(tree, taken, models[i], one)))
-                for one in (found[i], again)
-            ]
-            found[i] = max(options, key=lambda one: one.score)
-        settled.append(i)
-        taken[_claim(tree, models[i], found[i])] = True
+    claims: dict[int, IntArray] = {}  # of those that are settled
+    for i in sorted(found, key=lambda i: -found[i].score):
+        most = MAX_SHARED if models[i].parent < 0 else MAX_SHARED_BY_PART
+        claimed = _claim(tree, models[i], found[i])
+        if _shared(claimed, claims.values()) > most:
+            contested = found[i]
+            again = _register_model(models[i], view, found, _explained(models, found, list(claims)))
+            found[i] = max((_apart(tree, models[i], one, claims) for one in (contested, again)), key=lambda r: r.score)
+            # Or does what has the contested points belong somewhere else?
+            holders = [k for k in claims if k != models[i].parent and _shared(claimed, [claims[k]]) > most]
+            if len(holders) == 1:
+                holder, others = holders[0], {k: claims[k] for k in claims if k != holders[0]}
+                keeping = _apart(tree, models[i], contested, others)
+                without_both = _explained(models, found | {i: contested}, [*others, i])
+                moved = _register_model(models[holder], view, found, without_both)
+                if keeping.score + moved.score > found[i].score + found[holder].score:
+                    found |= {i: keeping, holder: moved}
+                    claims[holder] = _claim(tree, models[holder], moved)
+        claims[i] = _claim(tree, models[i], found[i])
     result = [found[i] for i in range(len(models))]
     if not any(model.varies for model in models):
         return result
@@ -353,10 +361,16 @@ def _claim(tree: cKDTree, model: Model, found: Registration) -> IntArray:
     return np.unique(np.concatenate([np.asarray(one, dtype=np.intp) for one in near]))
 
 
-def _shared(tree: cKDTree, taken: NDArray[np.bool_], model: Model, found: Registration) -> float:
-    """Share of the points that an object explains that are ``taken (M,)``."""
-    claimed = _claim(tree, model, found)
-    return float(taken[claimed].mean()) if len(claimed) else 0.0
+def _shared(claimed: IntArray, claims: Iterable[IntArray]) -> float:
+    """Share of the points ``claimed (N,)`` by an object that are in ``claims`` of others."""
+    return (
+        float(np.isin(claimed, np.concatenate([np.zeros(0, dtype=np.intp), *claims])).mean()) if len(claimed) else 0.0
+    )
+
+
+def _apart(tree: cKDTree, model: Model, found: Registration, claims: Mapping[int, IntArray]) -> Registration:
+    """``found``, whose fitness counts only for points that are in no other object's ``claims``."""
+    return replace(found, fitness=found.fitness * (1 - _shared(_claim(tree, model, found), claims.values())))
 
 
 def _another_template(view: View, found: Registration, templates: Sequence[Template], seed: int) -> list[Template]:
@@ -380,7 +394,10 @@ def _template_of(home: View, piece: IntArray, seed: int) -> Template:
 def _template(view: View, to_reference: FloatArray, xyzrgb: Float32Array, known: Float32Array, seed: int) -> Template:
     """Of ``xyzrgb (N, 6)`` and of the cells near ``known (M, 6)``, both in the reference image's frame."""
     points = transform_points(to_reference, view.cell_points)
-    near = subsample(np.flatnonzero(cKDTree(known[:, :3]).query(points)[0] < SAME_OBJECT_M), MAX_TEMPLATE_CELLS, seed)
+    distance = cKDTree(known[:, :3]).query(points)[0]
+    # Beside a higher thing, the mean point of every cell of a small one may be that of the other.
+    near = np.flatnonzero(distance <= max(SAME_OBJECT_M, distance.min()))
+    near = subsample(near, MAX_TEMPLATE_CELLS, seed)
     kept = subsample(np.arange(len(xyzrgb)), MAX_TEMPLATE_POINTS, seed)
     return Template(view, xyzrgb[kept], view.cells[near], points[near])
 
@@ -403,7 +420,7 @@ def register(
         others = cKDTree(taken)
         target = target[others.query(target[:, :3], distance_upper_bound=CLAIM_M)[0] > CLAIM_M]
         free = np.flatnonzero(others.query(view.cell_points, distance_upper_bound=CLAIM_M)[0] > CLAIM_M)
-        if len(target) < MIN_FOREGROUND_POINTS or not len(free):
+        if len(target) < MIN_TARGET_POINTS or not len(free):
             return Registration(np.eye(4), 0.0, 0.0, 0)
     similar = [t.view.descriptors.similarities(t.cells, view.descriptors, view.cells) for t in templates]
     with_foreground = [table[:, free] for table in similar]

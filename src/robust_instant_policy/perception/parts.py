@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
 from robust_instant_policy.perception.descriptors import IntArray
-from robust_instant_policy.perception.view import GAP_M, MIN_FOREGROUND_POINTS, View, connected_pieces
+from robust_instant_policy.perception.view import GAP_M, View, connected_pieces
 
 UNEXPLAINED_M = 0.008  # distance from the surfaces of the other images
 PERCENTILE = 75.0  # over the images: a part need not move in all of them
@@ -53,7 +53,7 @@ def _connected(home: View, piece: IntArray, which: BoolArray) -> list[BoolArray]
     number = connected_pieces(home.points[piece[chosen]], GAP_M)
     parts = []
     for members in sorted((chosen[number == n] for n in np.unique(number)), key=len, reverse=True):
-        if len(members) >= max(MIN_FOREGROUND_POINTS, MIN_SHARE * len(piece)):
+        if len(members) >= max(home.least, MIN_SHARE * len(piece)):
             parts.append(np.isin(np.arange(len(piece)), members))
     return parts
 

@@ -25,10 +25,11 @@ from robust_instant_policy.perception.table import Table, levelling
 from robust_instant_policy.pointcloud import in_metres, steady
 
 MAX_CENTRE_OFFSET = 0.4  # of the principal point from the image centre, of half the image
-MIN_EDGE_PX = 320  # of the longer edge after subsampling: enough for millimetres, and fast
+SPACING_M = 0.003  # between points, where the image has as many: enough for millimetres, and fast
 UNBOUNDED = np.array([[-np.inf] * 3, [np.inf] * 3])  # metres
 MIN_STEADY_PIXELS = 100
-MIN_FOREGROUND_POINTS = 25
+MIN_OBJECT_M2 = 1.5e-4  # of the image of an object
+MIN_OBJECT_POINTS = 12  # fewer have no shape
 MIN_DISTANCE_SMOOTHED = 4.0  # Mahalanobis distance of a flat point's smoothed colour from the table's,
 MIN_DISTANCE_POINT = 2.5  # and of its own colour, so that smoothing adds no border to objects
 SMOOTHING_PX = 5  # evens out the grain of the table
@@ -39,8 +40,7 @@ COLOUR_NOISE = 0.02  # standard deviation of the camera's noise in a colour chan
 GAP_M = 0.015  # foreground points further apart in space belong to different pieces,
 GAP_PX = 3  # but those of pixels this near do not,
 HIDDEN_GAP_M = 0.020  # nor those of such pixels this near in a horizontal direction: sides may be hidden from above
-MIN_PIECE_POINTS = 15
-MIN_TOLD_POINTS = 8  # smaller pieces are noise
+MIN_TOLD_SHARE = 1 / 3  # of the size of an object: smaller pieces are noise
 MAX_TOLD = 3
 TARGET_M = 0.005  # edge of the cubes with one point each in `View.target`
 COLOUR_SCALE_M = 0.06  # metres in an XYZRGB point for the difference between black and white in one channel
@@ -72,7 +72,8 @@ class View:
     units of `COLOUR_SCALE_M`; ``pieces``, the points' numbers by connected piece; ``target (M, 6)``, a sample of
     ``xyzrgb`` to which objects are registered; ``cells (C,)`` of the descriptor map: first those with foreground,
     whose mean points are ``cell_points (F, 3)``, then their neighbours. ``labels (h, w)``, subsampled by ``stride``: a
-    pixel's piece, or the key in `REASONS` of what it is instead. ``notes`` tell what was unusual.
+    pixel's piece, or the key in `REASONS` of what it is instead. ``least``: points of the smallest object.
+    ``notes`` tell what was unusual.
     """
 
     observation: Observation
@@ -87,6 +88,7 @@ class View:
     cell_points: FloatArray
     labels: NDArray[np.int16]
     stride: int
+    least: int
     notes: tuple[str, ...]
 
 
@@ -104,7 +106,9 @@ def make_view(
     depth, note = in_metres(observation.depth)
     if not np.isfinite(depth).any():
         raise KeypointError("the depth image has no reading at all; check the camera's depth stream")
-    stride = max(1, max(depth.shape) // MIN_EDGE_PX)
+    pixel_m = float(np.nanmedian(depth)) / observation.intrinsics[0, 0]
+    stride = max(1, int(SPACING_M / pixel_m))
+    least = max(MIN_OBJECT_POINTS, round(MIN_OBJECT_M2 / (stride * pixel_m) ** 2))
     usable = steady(depth)[::stride, ::stride]
     pixels = np.argwhere(usable)[:, ::-1] * stride
     if len(pixels) < MIN_STEADY_PIXELS:
@@ -132,15 +136,16 @@ def make_view(
         to_level = levelling(table.plane)
         points, to_world = points @ to_level[:3, :3].T, invert_pose(to_level)
         observation = replace(observation, camera_pose=to_level @ observation.camera_pose)
-    footprint = GAP_PX * stride * float(np.nanmedian(depth)) / observation.intrinsics[0, 0]
     foreground = np.flatnonzero(label == 0)
-    label[foreground] = connected_pieces(points[foreground], max(GAP_M, footprint))
+    label[foreground] = connected_pieces(points[foreground], max(GAP_M, GAP_PX * stride * pixel_m))
     _join_hidden(label, points, usable)
-    small = _leave_out(label, heights, pixels)
+    small = _leave_out(label, heights, pixels, least)
 
     kept = np.flatnonzero(label >= 0)
-    if len(kept) < MIN_FOREGROUND_POINTS:
-        raise KeypointError("nothing stands out from the table in an image; is the object in the workspace?")
+    if not len(kept):
+        raise KeypointError(
+            f"nothing stands out from the table in an image; is the object in the workspace? {small}".rstrip()
+        )
     at = pixels[kept, 1], pixels[kept, 0]
     colours = np.divide(observation.rgb[at], 255, dtype=np.float32)
     labels = np.full(usable.shape, UNKNOWN, dtype=np.int16)
@@ -150,8 +155,7 @@ def make_view(
     pieces = tuple(np.flatnonzero(label == piece) for piece in range(label.max() + 1))
     # Of equal density: near or separate things have no more weight than others.
     target = xyzrgb[np.unique(np.floor(points / TARGET_M).astype(int), axis=0, return_index=True)[1]]
-    cells, inverse, counts = np.unique(descriptors.cells_at(pixels[kept]), return_inverse=True, return_counts=True)
-    cell_points = np.stack([np.bincount(inverse, axis) for axis in points.T], axis=1) / counts[:, None]
+    cells, cell_points = _cell_points(descriptors.cells_at(pixels[kept]), label, points)
     neighbours = np.setdiff1d([descriptors.shifted(cells, row, col) for row, col in NEIGHBOURS], cells)
     cells = np.concatenate([cells, neighbours])
     notes = tuple(line for line in (note, small) if line)
@@ -168,6 +172,7 @@ def make_view(
         cell_points,
         labels,
         stride,
+        least,
         notes,
     )
 
@@ -177,6 +182,18 @@ def subsample(indices: IntArray, count: int, seed: int) -> IntArray:
     if len(indices) <= count:
         return indices
     return np.sort(np.random.default_rng(seed).choice(indices, count, replace=False))
+
+
+def _cell_points(cells: IntArray, label: IntArray, points: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The different ones of ``cells (N,)``, and for each the mean of its ``points (N, 3)`` of the most frequent piece.
+
+    The mean of all points of a cell at the border of a thing would lie neither on that nor on what is behind it.
+    """
+    shown, which, counts = np.unique(np.stack([cells, label]), axis=1, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(which.reshape(-1), axis) for axis in points.T], axis=1) / counts[:, None]
+    order = np.lexsort((-counts, shown[0]))
+    different, first = np.unique(shown[0][order], return_index=True)
+    return different, means[order[first]]
 
 
 def _check_resolution(observation: Observation) -> None:
@@ -249,8 +266,9 @@ def _join_hidden(label: IntArray, points: FloatArray, usable: NDArray[np.bool_])
     label[label >= 0] = connected_components(graph, directed=False)[1][label[label >= 0]]
 
 
-def _leave_out(label: IntArray, heights: FloatArray, pixels: IntArray) -> str:
-    """Mark in ``label (N,)`` the pieces that are too small or reach in over the border; number the others from 0.
+def _leave_out(label: IntArray, heights: FloatArray, pixels: IntArray, least: int) -> str:
+    """Mark in ``label (N,)`` the pieces of fewer than ``least`` points or that reach in over the border; number the
+    others from 0.
 
     Returns a line that tells where things are that are too small, or nothing.
     """
@@ -260,10 +278,10 @@ def _leave_out(label: IntArray, heights: FloatArray, pixels: IntArray) -> str:
     number, small = 0, []
     for piece in np.unique(label[label >= 0]):
         members = np.flatnonzero(label == piece)
-        if MIN_TOLD_POINTS <= len(members) < MIN_FOREGROUND_POINTS and heights[members].min() > 0:
+        if MIN_TOLD_SHARE * least <= len(members) < least and heights[members].min() > 0:
             small.append("({:.0f}, {:.0f})".format(*pixels[members].mean(axis=0)))
         crossing = heights[members][at_border[members]]
-        if len(members) < MIN_PIECE_POINTS:
+        if len(members) < least:
             label[members] = SMALL
         elif len(crossing) and crossing.min() > HOVERING_M:
             label[members] = BORDER

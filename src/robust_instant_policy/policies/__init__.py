@@ -28,6 +28,7 @@ from robust_instant_policy.policies.gp import KeypointRegression
 from robust_instant_policy.policies.instant import KeypointActionTokens
 from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
 from robust_instant_policy.policies.neighbours import Neighbours
+from robust_instant_policy.policies.own_keypoints import KeypointSource
 from robust_instant_policy.policies.policy import ClosedLoopPolicy, Plan, Policy, Progress, Stage, Usage
 from robust_instant_policy.policies.rip import RobustInstantPolicy
 from robust_instant_policy.policies.sampling import Proposal, Samples, propose, sample
@@ -47,6 +48,7 @@ __all__ = [
     "KeypointActionTokens",
     "KeypointPolicy",
     "KeypointRegression",
+    "KeypointSource",
     "LocatedScene",
     "Neighbours",
     "Plan",

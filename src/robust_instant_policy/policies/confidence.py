@@ -21,8 +21,8 @@ from robust_instant_policy.geometry import FloatArray, robust_std
 from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
-    "constant": 3.99, "distortion": 1.14, "prediction": 1.88, "novelty": 1.7, "displacement": 1.37,
-    "precision": 0.99, "doubts": 1.0, "warnings": 1.44,
+    "constant": 3.85, "distortion": 1.67, "prediction": 1.88, "novelty": 1.08, "displacement": 1.34,
+    "precision": 1.03, "imprecision": 0.91, "doubts": 1.0, "warnings": 1.48,
 }  # fmt: skip
 UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
 
@@ -36,11 +36,13 @@ GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small mo
 # Up to these values evidence says nothing: sound scenes have them.
 GOOD_DISTORTION = 2.0
 GOOD_PREDICTION_M = 0.015
+GOOD_IMPRECISION_M = 0.006
 GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT = 0.015, 1.5  # or that many times the demonstrations' own
 GOOD_PRECISION_M = 0.025
 LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one scene
 NOISE_M = 0.02  # variation of a coordinate below which it says nothing about a scene
 RIGID_M = 0.010  # variation of the distance of two keypoints below which they belong to one rigid thing
+NEAREST = 3  # keypoints with which each is compared where nothing is rigid
 DISTANCE_M = 0.003  # with which a distance between keypoints is measured
 RECORDING = {"gripper state", "grasp", "rotation"}  # kinds of findings
 MIN_SCENES = 3  # below which nothing is known of their variation
@@ -53,7 +55,8 @@ class Evidence:
     ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``vote`` in [0, 1] for the way to act
     that was followed, 0 where either of two may be meant (`Prompt.vote`); ``distortion`` of the distances between
     keypoints (see `distortion`); ``prediction``, metres, the error with which demonstrations predict each other at the
-    key step at which they do so best (see `prediction`); ``novelty``, how far the scene lies from the demonstrations
+    key step at which they do so best (see `prediction`), ``imprecision`` that at the gripper change at which they do so
+    worst (see `imprecision`); ``novelty``, how far the scene lies from the demonstrations
     (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and ``precision``, that
     of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording (`doubts`), other
     ``warnings``, and ``errors``.
@@ -63,6 +66,7 @@ class Evidence:
     vote: float
     distortion: float
     prediction: float
+    imprecision: float
     novelty: float
     displacement: float
     precision: float
@@ -87,6 +91,7 @@ class Evidence:
         found = {
             "distortion": self.distortion / GOOD_DISTORTION,
             "prediction": self.prediction / GOOD_PREDICTION_M,
+            "imprecision": self.imprecision / GOOD_IMPRECISION_M,
             "novelty": self.novelty,
             "displacement": self.displacement
             / max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision))),
@@ -121,6 +126,13 @@ def prediction(errors: FloatArray) -> float:
     return float(np.median(between, axis=0).min())
 
 
+def imprecision(errors: FloatArray) -> float:
+    """Metres, from the errors ``(I, S)`` of `leave_one_out`: the median over the demonstrations at the worst gripper
+    change; NaN without one. Where things are grasped and released, an error is often a failure."""
+    between = errors[:, 1:-1]
+    return float(np.median(between, axis=0).max()) if between.shape[1] else float("nan")
+
+
 def novelty(demonstrated: FloatArray, keypoints: FloatArray) -> float:
     """How far a scene lies from the demonstrations: its squared Mahalanobis distance, over the largest among them.
 
@@ -151,27 +163,34 @@ def _squared_distance(rows: FloatArray, row: FloatArray) -> float:
 def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
     """How far distances between keypoints of one thing differ from the demonstrations', of the worst thing.
 
-    A thing is a set of keypoints joined by distances that the demonstrations preserve. For each: the upper quartile of
-    the differences from the median distances, over their variation, and over the demonstrations' own quartile; above 1
-    they differ by more than usual. ``demonstrated (I, K, 3)`` and ``keypoints (K, 3)`` in metres; NaN for fewer than
-    `MIN_SCENES`, or where no distance is preserved.
+    A keypoint is compared with its `NEAREST` keypoints, those to which its distance varies least, and with all to which
+    it is preserved (`RIGID_M`); a thing is what the first of them and the preserved distances join. For each thing: the
+    upper quartile of the differences from the median distances, over their variation, and over the demonstrations' own
+    quartile; above 1 they differ by more than usual. ``demonstrated (I, K, 3)`` and ``keypoints (K, 3)`` in metres; NaN
+    for fewer than `MIN_SCENES`, or for a single keypoint.
     """
-    if len(demonstrated) < MIN_SCENES:
+    count = len(keypoints)
+    if len(demonstrated) < MIN_SCENES or count < 2:
         return float("nan")
-    pairs = np.triu_indices(len(keypoints), 1)
+    pairs = np.triu_indices(count, 1)
     shown, new = (np.linalg.norm((p[..., :, None, :] - p[..., None, :, :]), axis=-1) for p in (demonstrated, keypoints))
-    shown, new = shown[:, *pairs], new[pairs]
-    variation = robust_std(shown)
-    rigid = variation < RIGID_M
-    _, thing = connected_components(coo_array((rigid, pairs), shape=(len(keypoints),) * 2), directed=False)
+    variation = robust_std(shown) + np.diag(np.full(count, np.inf))
+    nearest = np.argsort(variation, axis=1)[:, : min(NEAREST, count - 1)]
+    compared, joined = variation < RIGID_M, variation < RIGID_M
+    compared[np.arange(count)[:, None], nearest] = True
+    joined[np.arange(count), nearest[:, 0]] = True
+    _, thing = connected_components(coo_array(joined), directed=False)
+    compared = (compared | compared.T)[pairs]
+    shown, new, first, second = (
+        shown[:, *pairs][:, compared],
+        new[pairs][compared],
+        *(thing[i][compared] for i in pairs),
+    )
 
     def quartiles(distances: FloatArray, others: FloatArray) -> FloatArray:
         off = np.abs(distances - np.median(others, axis=0)) / np.maximum(robust_std(others), DISTANCE_M)
-        return np.array([np.quantile(off[rigid & (thing[pairs[0]] == one)], 0.75) for one in things])
+        return np.array([np.quantile(off[(first == one) | (second == one)], 0.75) for one in range(thing.max() + 1)])
 
-    things = np.unique(thing[pairs[0]][rigid])
-    if not len(things):
-        return float("nan")
     usual = np.median([quartiles(row, np.delete(shown, index, axis=0)) for index, row in enumerate(shown)], axis=0)
     return float((quartiles(new, shown) / np.maximum(usual, 1.0)).max())
 

@@ -12,8 +12,9 @@ from robust_instant_policy.context.alignment import align
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.perception import KeypointExtractor, Located
+from robust_instant_policy.perception import CORRESPONDENCES, KeypointExtractor, Located
 from robust_instant_policy.policies.confidence import recognition
+from robust_instant_policy.policies.own_keypoints import OwnKeypoints
 from robust_instant_policy.policies.policy import Progress, Stage, Stopwatch, no_progress
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.sanity import Envelope, Finding, SetReport, Surroundings, View, check_demonstrations
@@ -34,7 +35,7 @@ class Context:
     """
 
     demonstrations: tuple[Demonstration, ...]
-    extractor: KeypointExtractor | None
+    extractor: KeypointExtractor | OwnKeypoints | None
     keypoints: FloatArray
     pixels: FloatArray
     trajectories: tuple[Trajectory, ...]
@@ -82,14 +83,7 @@ def build_context(
     report = check_demonstrations(demonstrations)
     report.raise_if_wrong()
     progress("keypoints", 0, 0)
-    extractor = KeypointExtractor(
-        settings.num_keypoints,
-        settings.features,
-        settings.workspace,
-        settings.seed,
-        settings.descriptors,
-        settings.keypoints,
-    ).fit([one.observation for one in demonstrations], [one.trajectory for one in demonstrations])
+    extractor = _extractor(demonstrations, settings)
     observations = [one.observation for one in demonstrations]
     given = _context(extractor.keypoints_, [one.trajectory for one in demonstrations], settings, observations)
     return replace(
@@ -100,6 +94,19 @@ def build_context(
         report=report,
         notes=(*extractor.notes_, *report.notes, *given.notes),
     )
+
+
+def _extractor(demonstrations: Sequence[Demonstration], settings: Settings) -> KeypointExtractor | OwnKeypoints:
+    if settings.keypoints not in CORRESPONDENCES:
+        return OwnKeypoints(settings.keypoints).fit(demonstrations)
+    return KeypointExtractor(
+        settings.num_keypoints,
+        settings.features,
+        settings.workspace,
+        settings.seed,
+        settings.descriptors,
+        str(settings.keypoints),
+    ).fit([one.observation for one in demonstrations], [one.trajectory for one in demonstrations])
 
 
 def context_of_keypoints(keypoints: FloatArray, trajectories: Sequence[Trajectory], settings: Settings) -> Context:

@@ -101,7 +101,8 @@ class Plan:
     0 where a check found an error; None from a method that has none. ``evidence`` is what it was made from, see
     `confidence.Evidence`.
     ``keypoints (K, 3)``, metres, world, ``pixels (K, 2)`` (u, v) and ``keypoint_confidence (K,)`` in [0, 1] are what
-    was recognised; ``frames`` are those in which it was planned; ``notes`` are for the user, one line each.
+    was recognised; ``frames`` are those in which it was planned; ``notes`` are for the user, one line each. ``cell`` is
+    the digest of the real cell it was made for, with its calibration and grippers; empty for a plan of no real cell.
     """
 
     trajectory: Trajectory
@@ -119,6 +120,7 @@ class Plan:
     notes: tuple[str, ...] = ()
     evidence: Mapping[str, float] = field(default_factory=dict)
     frames: tuple[FrameUse, ...] = ()
+    cell: str = ""
 
     def save(self, path: str | Path) -> None:
         """Write the plan as JSON, whole or not at all. Raises `DatasetError` when that is not possible."""
@@ -132,6 +134,7 @@ class Plan:
             "notes": list(self.notes),
             "evidence": dict(self.evidence),
             "frames": [{**vars(frame), "pose": frame.pose.tolist()} for frame in self.frames],
+            "cell": self.cell,
         }
         write_whole(Path(path), (json.dumps(content, allow_nan=False) + "\n").encode())
 
@@ -157,6 +160,7 @@ class Plan:
                 notes=_checked_notes(content["notes"]),
                 evidence=_checked_evidence(content.get("evidence", {})),  # plans of version 0.1 have none
                 frames=tuple(_frame(frame) for frame in content.get("frames", [])),
+                cell=str(content.get("cell", "")),
                 **{name: _array(content, name, sizes) for name in _ARRAYS},
             )
         except OSError as error:

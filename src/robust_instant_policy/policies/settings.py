@@ -12,6 +12,8 @@ from robust_instant_policy.checks import checked_positive, checked_whole
 from robust_instant_policy.context import Frames, Layout
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError, UsageError
 from robust_instant_policy.perception import CORRESPONDENCES, PAPER_REAL, PAPER_SIMULATION, DescriptorSettings
+from robust_instant_policy.plugins import is_own
+from robust_instant_policy.policies.own_keypoints import KeypointSource
 from robust_instant_policy.regression import DEFAULT_DOF
 from robust_instant_policy.regression.gripper import ESTIMATORS
 from robust_instant_policy.trajectory import TARGET_STEPS
@@ -41,8 +43,9 @@ class Settings:
 
     Keypoints: ``num_keypoints`` K; ``features`` names the image descriptors, ``column`` that of the paper's Table II
     with their parameters ("auto": by the size of the images); ``keypoints`` is how they are found in an image,
-    "registration" of objects or "nearest" descriptors; ``workspace ((x, y, z), (x, y, z))`` are the lower and upper
-    corner of what is registered, metres, world. Trajectories: ``downsampling`` "masked" or "uniform"
+    "registration" of objects, "nearest" descriptors, or a source of one's own, a `KeypointSource` or the
+    ``module:Class`` of one; ``workspace ((x, y, z), (x, y, z))`` are the lower and upper corner of what is registered,
+    metres, world. Trajectories: ``downsampling`` "masked" or "uniform"
     to ``num_steps`` steps. Prompt: ``frames`` and ``layout``, see `write_prompt`. Samples: ``num_queries`` Q at
     ``temperature``; with ``adaptive``, three at first and up to Q while the candidates agree little. Aggregation:
     ``dof`` ν, infinity for the Gaussian ablation; ``estimator``, see `robust_gripper_trajectory`. ``seed`` is that of
@@ -52,7 +55,7 @@ class Settings:
     num_keypoints: int = 10
     features: str = "auto"
     column: str = "auto"
-    keypoints: str = "registration"
+    keypoints: str | KeypointSource = "registration"
     workspace: tuple[tuple[float, ...], ...] | None = None
     downsampling: str = "masked"
     num_steps: int = TARGET_STEPS
@@ -72,8 +75,10 @@ class Settings:
         if self.temperature != 0:
             checked_positive("temperature", self.temperature)
         for name, known in WORDS.items():
-            if getattr(self, name) not in known:
-                raise UnknownNameError(name, getattr(self, name), known)
+            word = getattr(self, name)
+            own = name == "keypoints" and (not isinstance(word, str) or is_own(word))
+            if not own and word not in known:
+                raise UnknownNameError(name, word, (*known, "module:Class") if name == "keypoints" else known)
         if self.workspace is not None:
             object.__setattr__(self, "workspace", _corners(self.workspace))
 

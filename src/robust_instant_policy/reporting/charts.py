@@ -12,6 +12,7 @@ from plotly.subplots import make_subplots
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.policies.policy import Plan
 from robust_instant_policy.reporting.pictures import keypoint_colour, tool_points
+from robust_instant_policy.robots.path import MeasuredPath
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
 MM = 1000.0
@@ -78,6 +79,26 @@ def paths_in_space(plan: Plan) -> go.Figure:
         text=[str(k) for k in range(len(keypoints))],
         marker={"size": 5, "color": [keypoint_colour(k) for k in range(len(keypoints))]},
     )
+    return _in_space(figure)
+
+
+def executed_paths(plan: Plan, path: MeasuredPath) -> go.Figure:
+    """The planned trajectory, and the commanded and measured paths between the fingertips, in the world."""
+    figure = go.Figure()
+    for arm in range(plan.trajectory.num_arms):
+        first = arm == 0
+        planned = {"mode": "markers", "name": "planned", "marker": {"color": ROBUST_COLOUR, "size": 3}}
+        _add_points(figure, tool_points(plan.trajectory, arm), showlegend=first, legendgroup="planned", **planned)
+        for points, name, colour in (
+            (path.commanded_tools, "commanded", CANDIDATE_COLOURS[0]),
+            (path.measured_tools, "measured", HALLUCINATED_COLOUR),
+        ):
+            look = {"mode": "lines", "line": {"color": colour, "width": 4}, "legendgroup": name}
+            _add_points(figure, points[:, arm], name=name, showlegend=first, **look)
+    return _in_space(figure)
+
+
+def _in_space(figure: go.Figure) -> go.Figure:
     axes = {f"{axis}axis_title": f"world {axis} [mm]" for axis in "xyz"}
     figure.update_layout(
         height=620,

@@ -41,6 +41,7 @@ CAUSES = {
     "samples": "samples: no candidate succeeds, or a single sample was executed",
     "regression": "regression: one of its candidates succeeds alone",
     "policy": "policy: the demonstrator's trajectory succeeds when it is replayed",
+    "unknown": "unknown: the task has no ground truth to tell",
 }
 
 

@@ -25,6 +25,7 @@ from robust_instant_policy.reporting.charts import (
     candidate_name,
     chart,
     dimensions_over_time,
+    executed_paths,
     paths_in_space,
     weights_over_time,
 )
@@ -39,33 +40,40 @@ from robust_instant_policy.reporting.pictures import (
     tool_points,
 )
 from robust_instant_policy.reporting.tables import NONE, Table
+from robust_instant_policy.robots.path import MeasuredPath
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 SHOWN_DEMONSTRATIONS = 10
 FRAME_AXIS_M = 0.04  # length of the axes of a frame in the picture
 MOSTLY = 0.5  # mean weight below which a hallucinated candidate was ignored more than followed
-RUN_FILE, PLAN_FILE, SEEN_FILE, CONTEXT_FILE, VIDEO_FILE, REPORT_FILE = (
+RUN_FILE, PLAN_FILE, SEEN_FILE, CONTEXT_FILE, VIDEO_FILE, MEASURED_FILE, REPORT_FILE = (
     "run.json",
     "plan.json",
     "observation.npz",
     "context.npz",
     "execution.mp4",
+    "measured.npz",  # of a run on real arms
     "report.html",
 )
 
 
 @dataclass(frozen=True)
 class RunRecord:
-    """The facts of a run that are not in the plan. ``success`` is None if the plan was not executed."""
+    """The facts of a run that are not in the plan.
+
+    ``seed`` is None for a scene in the real world; ``success`` is None if the plan was not executed; ``config`` is
+    `Variant.config`, empty for runs of versions that did not note it.
+    """
 
     task: str
     description: str
-    seed: int
+    seed: int | None
     llm: str
     method: str
     success: bool | None
     outcome: str
     stages: tuple[Stage, ...]
+    config: str = ""
 
     def save(self, folder: Path) -> None:
         write_whole(folder / RUN_FILE, (json.dumps(asdict(self), indent=1) + "\n").encode())
@@ -101,6 +109,7 @@ def write_report(folder: str | Path) -> Path:
     observation = Observation.load(folder / SEEN_FILE)
     shown = _load_context(folder / CONTEXT_FILE)
     video = folder / VIDEO_FILE
+    measured = MeasuredPath.load(folder / MEASURED_FILE) if (folder / MEASURED_FILE).exists() else None
     page = render(
         "run.html",
         title=f"{record.task}: {record.outcome}",
@@ -120,6 +129,8 @@ def write_report(folder: str | Path) -> Path:
         candidates=_candidate_table(plan),
         weights=chart(weights_over_time(plan)) if plan.candidates else "",
         dimensions=chart(dimensions_over_time(plan)),
+        executed=chart(executed_paths(plan, measured)) if measured is not None else "",
+        execution=_execution_table(measured) if measured is not None else None,
         confidence=_confidence_table(plan),
         notes=plan.notes,
         stages=_stage_table(record.stages),
@@ -239,6 +250,25 @@ def _confidence_table(plan: Plan) -> Table:
     if plan.confidence is not None:
         rows.insert(0, ("**confidence**", f"**{plan.confidence:.2f}**"))
     return Table(("quantity", "value"), tuple(rows), "")
+
+
+def _execution_table(path: MeasuredPath) -> Table:
+    """How far the measured path is from the commanded one, for each arm."""
+    rows = []
+    for arm in range(path.tool_errors.shape[1]):
+        errors, joints = path.tool_errors[:, arm], np.abs(path.commanded - path.measured)[:, arm, :-1]
+        if len(errors):
+            rows.append(
+                (
+                    str(arm + 1),
+                    f"{len(errors) / path.rate_hz:.1f}",
+                    f"{MM * np.median(errors):.1f}",
+                    f"{MM * errors.max():.1f}",
+                    f"{np.rad2deg(joints.max()):.1f}",
+                )
+            )
+    head = ("arm", "seconds", "tool: median [mm]", "tool: largest [mm]", "joint: largest [degrees]")
+    return Table(head, tuple(rows), "")
 
 
 def _stage_table(stages: Sequence[Stage]) -> Table:

@@ -13,6 +13,7 @@ import trimesh
 from PIL import Image
 
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.policies import Context, LocatedScene, Plan
 from robust_instant_policy.studio.cell import Surface
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
@@ -136,7 +137,7 @@ def keypoint_picture(rgb: np.ndarray, context: Context | None = None, scene: Loc
 def _known(context: Context, scene: LocatedScene, index: int) -> str:
     """What is known of a keypoint: its object, how sure it is here, and in the demonstrations."""
     sure = f"here {scene.located.confidence[index]:.2f}"
-    if context.extractor is None:
+    if not isinstance(context.extractor, KeypointExtractor):
         return f"keypoint {index}: confidence {sure}"
     shown = ", ".join(f"{value:.2f}" for value in context.extractor.confidence_[:, index])
     return (

@@ -346,17 +346,27 @@ class PlanPanel:
         return self._plan.trajectory
 
     def _start_preview(self) -> None:
+        """Let a ghost of the arms, or of the gripper's three points where there are none, go along the plan."""
         trajectory, cell = self._chosen(), self._session.cell
         self._preview.set()
         self._preview = stopped = threading.Event()
         if cell is None or not cell.arms:
             sweep = partial(self._sweep_triangle, trajectory, stopped)
-        else:
-            sweep = partial(self._sweep, self._motion(trajectory), cell, stopped)
+        else:  # poses are computed here: the kinematics belong to the session's thread
+            joints = self._motion(trajectory).joints
+            shown = joints[np.linspace(0, len(joints) - 1, round(PREVIEW_S * PREVIEW_HZ)).astype(int)]
+            poses = [
+                {
+                    name: pose
+                    for arm, own in zip(cell.arms, step, strict=True)
+                    for name, pose in arm.kinematics.body_poses(own).items()
+                }
+                for step in shown
+            ]
+            sweep = partial(self._sweep, self._ghost(cell, poses[0]), poses, stopped)
         threading.Thread(target=sweep, daemon=True).start()
 
     def _sweep_triangle(self, trajectory: Trajectory, stopped: threading.Event) -> None:
-        """Let the gripper's three points go along ``trajectory`` until ``stopped``."""
         node = self._scene.add_line_segments(
             "/ghost/triangle", np.zeros((1, 2, 3)), DEMONSTRATION, thickness=6.0, thickness_units="screen"
         )
@@ -368,21 +378,14 @@ class PlanPanel:
             time.sleep(1 / PREVIEW_HZ)
         node.remove()
 
-    def _sweep(self, motion: Motion, cell: Cell, stopped: threading.Event) -> None:
-        """Let a ghost of the arms go through ``motion`` until ``stopped``."""
-        links: dict[str, Any] = {}
-        for step in np.linspace(0, len(motion.joints) - 1, round(PREVIEW_S * PREVIEW_HZ)).astype(int):
+    def _sweep(self, ghost: dict[str, Any], path: list[dict[str, FloatArray]], stopped: threading.Event) -> None:
+        for poses in path:
             if stopped.is_set():
                 break
-            for arm, joints in zip(cell.arms, motion.joints[step], strict=True):
-                poses = arm.kinematics.body_poses(joints)
-                if not step:
-                    links |= self._ghost(cell, poses)
-                for name, pose in poses.items():
-                    if name in links:
-                        place(links[name], pose)
+            for name, node in ghost.items():
+                place(node, poses[name])
             time.sleep(1 / PREVIEW_HZ)
-        for node in links.values():
+        for node in ghost.values():
             node.remove()
 
     def _ghost(self, cell: Cell, poses: dict[str, FloatArray]) -> dict[str, Any]:

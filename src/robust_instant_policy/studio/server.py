@@ -13,12 +13,13 @@ from pathlib import Path
 import viser
 
 from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.plugins import is_own
 from robust_instant_policy.studio.cell import Cell
 from robust_instant_policy.studio.gate import Gate
 from robust_instant_policy.studio.page import Page
 from robust_instant_policy.studio.recorded import RecordedCell
 from robust_instant_policy.studio.simulated import SimulatedCell
-from robust_instant_policy.tasks import TASK_NAMES
+from robust_instant_policy.tasks import TASK_NAMES, is_installed
 
 FAREWELL_S = 0.3  # for browsers to be told that the server stops
 
@@ -40,7 +41,7 @@ class Choice:
         return self.demos if self.demos is not None and task == self.task else self.data / task
 
     def cell(self, task: str, demonstrations: Sequence[Demonstration]) -> Cell:
-        if task in TASK_NAMES and (self.observation is None or task != self.task):
+        if (is_own(task) or is_installed(task)) and (self.observation is None or task != self.task):
             return SimulatedCell(task)
         seen = None if self.observation is None else Observation.load(self.observation)
         return RecordedCell(task, demonstrations, seen)

@@ -1,7 +1,8 @@
 """How hard a task's scenes are: what every task varies beside its own objects.
 
-`PAPER` draws the scenes of the paper. `HARD` adds what a real table has: a noisy camera, objects rotated by up to half
-a turn, distractors, other tables and light, a rod that hides a part of the objects, and another start pose of the arm.
+`PAPER` draws the scenes of the paper. `NOISE` draws the same, seen by a noisy depth camera. `HARD` adds what a real
+table has: a noisy camera, objects rotated by up to half a turn, distractors, other tables and light, a rod that hides a
+part of the objects, and another start pose of the arm.
 A cell draws everything from the `Layout` of one episode, so a task only says where its objects are and what they need.
 """
 
@@ -59,7 +60,8 @@ class Level:
 
 PAPER = Level("paper")
 HARD = Level("hard", CameraNoise(), np.pi, (2, 5), furnishing=True, hides=True, start=0.08, objects="unseen")
-LEVELS = {level.name: level for level in (PAPER, HARD)}
+NOISE = Level("noise", CameraNoise())
+LEVELS = {level.name: level for level in (PAPER, NOISE, HARD)}
 
 
 def make_level(name: str) -> Level:

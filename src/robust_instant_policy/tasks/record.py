@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from dataclasses import replace
+from typing import Any, Protocol
 
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import RipError
-from robust_instant_policy.tasks.task import Image, Task
+from robust_instant_policy.tasks.task import Image, Task, require
 
 MAX_FAILURES_IN_A_ROW = 50  # after as many failures in a row, recording stops
 
@@ -47,16 +48,19 @@ def record(
 
     ``with_images`` and ``every`` as in `Task.demonstrate`; the writer's rate is that of the steps that are kept.
     Continues after the last seed of the writer, so an interrupted recording gets the same episodes as an
-    uninterrupted one. After every attempt ``on_progress`` receives (stored episodes, requested episodes,
-    discarded attempts). Returns the number of discarded attempts.
+    uninterrupted one. Demonstrations are labelled with the task's name and the seed. After every attempt
+    ``on_progress`` receives (stored episodes, requested episodes, discarded attempts). Returns the number of discarded
+    attempts. Raises `MissingMethodError` for a task without a demonstrator.
     """
+    require(task, "demonstrate")
+    asked: dict[str, Any] = {"with_images": with_images, "every": every} if with_images or every > 1 else {}
     if writer.last_seed is not None:
         seed = max(seed, writer.last_seed + 1)
     in_a_row = 0
     while writer.num_episodes < num_episodes:
-        attempt = task.demonstrate(seed, with_images, every)
+        attempt = task.demonstrate(seed, **asked)
         if attempt.success:
-            writer.add(attempt.demonstration, attempt.images)
+            writer.add(replace(attempt.demonstration, task=task.name, seed=seed), attempt.images)
             in_a_row = 0
         else:
             writer.discard(seed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from itertools import count
 from typing import Any, Protocol
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import RipError, UnreachableError
+from robust_instant_policy.errors import RipError, UnknownNameError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.waypoints import plan_onward, plan_poses, plan_waypoints
@@ -45,12 +46,24 @@ class TaskSpec:
     asset_sources: tuple[str, ...] = ("code",)
 
 
+def spec_of(module: str, objects: str, assets: str) -> TaskSpec:
+    """``SPEC`` of ``module``, if it has the set of ``objects`` and the source of ``assets``; else raises
+    `UnknownNameError`."""
+    spec: TaskSpec = import_module(module).SPEC
+    if objects not in spec.object_sets:
+        raise UnknownNameError(f"set of objects of {spec.name}", objects, spec.object_sets)
+    if assets not in spec.asset_sources:
+        raise UnknownNameError(f"source of assets of {spec.name}", assets, spec.asset_sources)
+    return spec
+
+
 class Cell(Protocol):
     """A gymnasium environment that holds a scene with A arms; see the methods of the same names in `Task`.
 
     ``advance`` takes one control step towards ``command (A·(J + 1),)``: for each arm the joint angles and the finger
-    travel, rad and m. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is
-    not done, empty if it is done. ``layout`` has the draws of the scene.
+    travel, rad and m; ``measured`` returns the same quantities, ``grip_loads (A,)`` each gripper's share of its force
+    limit. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is not done,
+    empty if it is done. ``layout`` has the draws of the scene.
     """
 
     layout: Layout
@@ -59,6 +72,8 @@ class Cell(Protocol):
     def photograph(self) -> Observation: ...
     def scene_truth(self) -> SceneTruth: ...
     def advance(self, command: FloatArray) -> None: ...
+    def measured(self) -> FloatArray: ...
+    def grip_loads(self) -> FloatArray: ...
     def tool_poses(self) -> FloatArray: ...
     def video_frame(self) -> np.ndarray: ...
     def failure(self) -> str: ...
@@ -106,22 +121,12 @@ class SimulatedTask:
         self._fresh = False  # no motion since the scene was built
 
     @property
-    def cell(self) -> Cell:
-        """The scene, for operation by hand."""
-        return self._cell
-
-    @property
-    def arms(self) -> Sequence[Arm]:
-        """The working arms, at home where the scene of the last `reset` has them."""
-        return self._arms
-
-    @property
     def timing(self) -> Timing:
         return self._timing
 
     def reset(self, seed: int) -> Observation:
         self._rebuild(seed)
-        return self._photograph()
+        return self.look()
 
     def execute(self, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
         if self._seed is None:
@@ -144,7 +149,7 @@ class SimulatedTask:
         motion = Motion.at_home(self._arms)
         steps, worst, failure = 0, 0.0, ""
         while steps < max_seconds * control_hz and not failure:
-            waypoints = controller.act(self._photograph().rgb, self._action(motion.closed[-1]))
+            waypoints = controller.act(self.look().rgb, self._action(motion.closed[-1]))
             if waypoints is None:
                 break
             try:
@@ -158,14 +163,28 @@ class SimulatedTask:
         failure = failure or self._cell.failure()
         return Execution(not failure, failure, steps / control_hz, worst)
 
-    def demonstrate(self, seed: int, with_images: bool = False, every: int = 1) -> Attempt:
-        observation = self.reset(seed)
-        rng = np.random.default_rng([seed, HAND_STREAM])
+    @property
+    def control_hz(self) -> float:
+        """Rate of `advance`."""
+        return self._timing.control_hz
+
+    @property
+    def arms(self) -> Sequence[Arm]:
+        """The working arms, with the start pose of the present scene as their home."""
+        return self._arms
+
+    def expert_path(self) -> tuple[FloatArray, np.ndarray]:
+        """Tool poses ``(N, A, 4, 4)`` and gripper commands ``(N, A)`` of the demonstrator in the scene of `reset`."""
+        rng = np.random.default_rng([self._seed or 0, HAND_STREAM])
         strokes = self._spec.expert(self._cell, rng)
         home = np.stack([arm.home_pose for arm in self._arms])
         if self._level.turn:
             strokes = shorter_turns(strokes)
-        poses, closed = perform(home, strokes, rng, self._timing.control_hz)
+        return perform(home, strokes, rng, self._timing.control_hz)
+
+    def demonstrate(self, seed: int, with_images: bool = False, every: int = 1) -> Attempt:
+        observation = self.reset(seed)
+        poses, closed = self.expert_path()
         images: list[Image] = []
         try:
             motion = plan_poses(poses, closed, self._arms, self._timing.control_hz)
@@ -181,6 +200,11 @@ class SimulatedTask:
         demonstration = Demonstration(observation, trajectory, self.record_hz / every, self.name, seed)
         return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
 
+    @property
+    def cell(self) -> Cell:
+        """The environment, as physics of an emulated robot."""
+        return self._cell
+
     def scene_truth(self) -> SceneTruth:
         """Ground truth of the camera's pixels, to measure perception; not for policies."""
         return self._cell.scene_truth()
@@ -194,8 +218,8 @@ class SimulatedTask:
         home = self._cell.layout.home(np.stack([arm.home for arm in self._usual_arms]))
         self._arms = [replace(arm, home=joints) for arm, joints in zip(self._usual_arms, home, strict=True)]
 
-    def _photograph(self) -> Observation:
-        """The camera's image, with the noise of the level."""
+    def look(self) -> Observation:
+        """What the camera sees now, with the noise of the level."""
         seen, self._images = self._cell.photograph(), self._images + 1
         if self._level.camera is None:
             return seen
@@ -239,7 +263,7 @@ class SimulatedTask:
 
         def before_step() -> None:
             if next(step) in steps:
-                images.append(self._photograph().rgb)
+                images.append(self.look().rgb)
 
         return before_step
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import MissingMethodError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.trajectory import Trajectory
@@ -19,6 +20,25 @@ SEED_BITS = 62  # of seeds, and of those counted up from them, which stand in ta
 
 Image = NDArray[np.uint8]
 FrameSink = Callable[[Image], None]
+
+
+# What a task may lack, and what it is needed for.
+OPTIONAL_METHODS = {
+    "demonstrate": "to record demonstrations and to replay them",
+    "follow": "for methods in closed loop (dp, kat-dp, --replan)",
+    "scene_truth": "to measure the errors of keypoints",
+}
+
+
+def offers(task: Task, method: str) -> bool:
+    """Whether ``task`` has the one of `OPTIONAL_METHODS` called ``method``."""
+    return callable(getattr(task, method, None))
+
+
+def require(task: Task, method: str) -> None:
+    """Raises `MissingMethodError` unless ``task`` `offers` ``method``."""
+    if not offers(task, method):
+        raise MissingMethodError(task.name, method, OPTIONAL_METHODS[method])
 
 
 def bounded_seed(seed: int, bits: int = SEED_BITS) -> int:
@@ -37,9 +57,9 @@ class Execution:
     """
 
     success: bool
-    failure: str
-    seconds: float
-    tracking_error: float
+    failure: str = ""
+    seconds: float = 0.0
+    tracking_error: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,17 +68,21 @@ class Attempt:
 
     demonstration: Demonstration
     success: bool
-    failure: str
+    failure: str = ""
     images: Image | None = field(default=None, repr=False)
 
 
 class Task(Protocol):
     """A scene, a robot, and a demonstrator.
 
+    A task of one's own needs `reset` and `execute` only (docs/own-tasks.md): the attributes have the defaults of
+    `own.DEFAULTS`, and what needs one of `OPTIONAL_METHODS` calls `require` or `offers` first.
+
     ``description`` is the task in one sentence, ``goal`` the condition of success ("the cube is in the goal").
     ``end_effectors`` names the grippers in the order of the columns of a trajectory. ``workspace (2, 3)`` are the lower
-    and upper corner, in metres, of the volume in which the arm works; keypoints outside it are ignored. ``record_hz``
-    and ``execute_hz`` are the rates of demonstrations and of executed waypoints, ``video_hz`` that of video frames.
+    and upper corner, in metres, of the volume in which the arm works; keypoints outside it are ignored (None: the whole
+    image is used). ``record_hz`` and ``execute_hz`` are the rates of demonstrations and of
+    executed waypoints, ``video_hz`` that of video frames.
     """
 
     name: str
@@ -68,7 +92,7 @@ class Task(Protocol):
     record_hz: float
     execute_hz: float
     video_hz: float
-    workspace: FloatArray
+    workspace: FloatArray | None
 
     def reset(self, seed: int) -> Observation:
         """Draw the scene of ``seed`` and take its image; the same seed gives the same scene and image."""

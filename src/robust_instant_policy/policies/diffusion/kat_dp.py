@@ -138,7 +138,7 @@ def _padded(actions: FloatArray) -> FloatArray:
 
 def _described(settings: Settings) -> str:
     """What decides the weights beside the demonstrations; what is usual has no name, as in earlier checkpoints."""
-    found = {settings.keypoints, settings.column} - {Settings().keypoints, Settings().column}
+    found = {str(settings.keypoints), settings.column} - {Settings().keypoints, Settings().column}
     return (
         f"{settings.num_keypoints} keypoints by {' '.join((settings.features, *sorted(found)))}, "
         f"{settings.downsampling} downsampling to {settings.num_steps} steps"

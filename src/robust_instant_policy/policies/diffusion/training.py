@@ -16,6 +16,7 @@ from torch import Tensor
 
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import ModelError
+from robust_instant_policy.files import file_stem
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.diffusion import checkpoint
 from robust_instant_policy.policies.diffusion.denoiser import Denoiser
@@ -95,7 +96,7 @@ def obtain(
     which must tell these data from others.
     """
     device = torch.device(training.device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    name = f"{title}-{checkpoint.fingerprint(settings, content)}"
+    name = f"{file_stem(title)}-{checkpoint.fingerprint(settings, content)}"
     finished = training.checkpoints / f"{name}.safetensors"
     with torch.random.fork_rng():
         torch.manual_seed(settings.seed)

@@ -23,6 +23,7 @@ from robust_instant_policy.tasks.aloha.robot import (
     CLOSED_M,
     FINGER_TRAVEL_M,
     FINGERS,
+    GRIP_FORCE_N,
     HOME_JOINTS,
     PARKED_JOINTS,
     TOOL,
@@ -242,6 +243,15 @@ class AlohaEnv(gymnasium.Env):
     def is_held(self, body: str, side: str = "left") -> bool:
         """Whether both fingers of the arm on a ``side`` press on a body."""
         return all(self.touch(body, f"{ARMS[side]}/{finger}_link") > HELD_N for finger in FINGERS)
+
+    def measured(self) -> FloatArray:
+        """Joint angles and finger travel of the working arms, ``(7·A,)``."""
+        return self._joints()
+
+    def grip_loads(self) -> FloatArray:
+        """Force of each working gripper as a share of its limit, ``(A,)``."""
+        forces = [self.data.actuator(f"{ARMS[side]}/{FINGERS[0]}").force[0] for side in self.end_effectors]
+        return np.abs(forces) / (2 * GRIP_FORCE_N)
 
     def _joints(self) -> FloatArray:
         """Joint angles and finger travel of the working arms, in the order of commands ``(7·A,)``."""

@@ -21,7 +21,7 @@ from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.tasks.level import PAPER, Distractor, Layout, Level, Region
 from robust_instant_policy.tasks.maniskill.carpentry import add_box, add_cylinder
 from robust_instant_policy.tasks.maniskill.paint import BLACK, Paint
-from robust_instant_policy.tasks.maniskill.robot import FINGER_TRAVEL_M, UR5eHandE
+from robust_instant_policy.tasks.maniskill.robot import FINGER_STIFFNESS, FINGER_TRAVEL_M, GRIP_FORCE_N, UR5eHandE
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 
 RECORD_HZ = 55.0  # "recorded at 55 Hz" (Oh et al. 2025, Sec. V-A.1)
@@ -112,6 +112,7 @@ class CellEnv(BaseEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.table_scene.initialize(env_idx)
+        self._told = FINGER_TRAVEL_M
         (joints,) = self.layout.home(np.array([HOME_JOINTS]))
         home = np.array([*joints, FINGER_TRAVEL_M, FINGER_TRAVEL_M], dtype=np.float32)
         self.agent.reset(home)
@@ -149,6 +150,7 @@ class CellEnv(BaseEnv):
         `step` also evaluates the task, which for a grasped object takes longer than the physics.
         """
         self.agent.drive(command)
+        self._told = float(command[-1])
         self._before_control_step()
         for _ in range(self._sim_steps_per_control):
             self.scene.step()
@@ -218,6 +220,15 @@ class CellEnv(BaseEnv):
     def video_frame(self) -> np.ndarray:
         """RGB frame ``(H, W, 3)`` uint8 of the camera beside the table."""
         return self.render_rgb_array()[0].cpu().numpy().astype(np.uint8)
+
+    def measured(self) -> FloatArray:
+        """Joint angles and finger travel, ``(7,)``."""
+        return self.agent.robot.get_qpos()[0, :7].numpy().astype(np.float64)
+
+    def grip_loads(self) -> FloatArray:
+        """Force of the gripper as a share of its limit, ``(1,)``, from the deflection of its drive."""
+        deflection = self.agent.robot.get_qpos()[0, 6] - self._told
+        return np.array([min(abs(FINGER_STIFFNESS * float(deflection)) / GRIP_FORCE_N, 1.0)])
 
     def tool_poses(self) -> FloatArray:
         """Pose of the arm's tool frame, ``(1, 4, 4)``."""

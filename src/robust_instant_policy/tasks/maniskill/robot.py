@@ -20,10 +20,11 @@ from mani_skill.utils.building.articulation_builder import ArticulationBuilder
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.link import Link
 
+from robust_instant_policy import motion
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 
-URDF_PATH = Path(__file__).with_name("ur5e_hande.urdf")
+URDF_PATH = Path(motion.__file__).with_name("urdf") / "ur5e_hande.urdf"
 
 ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 FINGER_JOINTS = ("left_finger", "right_finger")

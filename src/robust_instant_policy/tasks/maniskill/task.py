@@ -6,11 +6,11 @@ import gc
 
 import gymnasium
 
-from robust_instant_policy.tasks.level import Level
+from robust_instant_policy.tasks.level import Level, make_level
 from robust_instant_policy.tasks.maniskill.arm import EXECUTE_HZ, ur5e_hande
 from robust_instant_policy.tasks.maniskill.cell import RECORD_HZ, WORKSPACE
 from robust_instant_policy.tasks.maniskill.renderer import require_renderer
-from robust_instant_policy.tasks.simulated_task import SimulatedTask, TaskSpec, Timing
+from robust_instant_policy.tasks.simulated_task import SimulatedTask, TaskSpec, Timing, spec_of
 
 TIMING = Timing(control_hz=RECORD_HZ, record_every=1, frame_every=4, execute_hz=EXECUTE_HZ)
 
@@ -32,3 +32,9 @@ class CellTask(SimulatedTask):
     def close(self) -> None:
         super().close()
         gc.unfreeze()
+
+
+def make(name: str, objects: str, assets: str, level: str) -> CellTask:
+    """The task ``name``; its module is called like it."""
+    spec = spec_of(f"{__package__}.{name.replace('-', '_')}", objects, assets)
+    return CellTask(spec, objects, assets, make_level(level))

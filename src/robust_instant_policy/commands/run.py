@@ -1,0 +1,209 @@
+"""`rip run`: plan for what a real cell's camera sees, show the plan, and execute it once it is confirmed."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from robust_instant_policy.commands.console import StageConsole
+from robust_instant_policy.commands.options import RUNS, add_method, method_settings, positive
+from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.errors import StoppedError, UsageError
+from robust_instant_policy.files import write_whole
+from robust_instant_policy.llm import connect
+from robust_instant_policy.motion.arm import Motion
+from robust_instant_policy.motion.guard import plan_guarded
+from robust_instant_policy.policies import RobustInstantPolicy
+from robust_instant_policy.policies.policy import Plan
+from robust_instant_policy.reporting.run import (
+    MEASURED_FILE,
+    PLAN_FILE,
+    SEEN_FILE,
+    RunRecord,
+    save_context,
+    write_report,
+)
+from robust_instant_policy.robots.cameras import make_camera
+from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.emulation.client import Emulation, devices_of
+from robust_instant_policy.robots.execution import is_parked, observe, park, require_trust
+from robust_instant_policy.robots.signals import stop_on_signals
+from robust_instant_policy.robots.station import Station
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--robot", type=Path, required=True, metavar="FILE", help="file of the cell")
+    parser.add_argument("--demos", required=True, metavar="DIR", help="folder of demonstrations of this cell")
+    parser.add_argument(
+        "--plan", type=Path, metavar="DIR", help="execute the plan of an earlier --dry-run in this folder"
+    )
+    parser.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
+    parser.add_argument("--queries", type=positive, default=5, metavar="Q", help="samples (default: %(default)s)")
+    parser.add_argument("--dry-run", action="store_true", help="everything but the motion: no arm is connected")
+    parser.add_argument("--yes", action="store_true", help="execute without asking")
+    parser.add_argument(
+        "--speed",
+        type=_share,
+        metavar="SHARE",
+        help="of the usual speed, 0.05 to 1 (default: 1, and first_run_speed until a run in this cell ended well)",
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/CELL)")
+    add_method(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    screen = StageConsole()
+    config = CellConfig.load(options.robot)
+    out = options.plan or options.out or RUNS / config.name
+    out.mkdir(parents=True, exist_ok=True)
+    with devices_of(config) as (config, emulation):
+        _Run(config, emulation, out, options, screen).run()
+    return 0
+
+
+class _Run:
+    """One run in the folder ``out``: image, plan, preview, confirmation, execution, page."""
+
+    def __init__(
+        self,
+        config: CellConfig,
+        emulation: Emulation | None,
+        out: Path,
+        options: argparse.Namespace,
+        screen: StageConsole,
+    ):
+        self._config, self._emulation, self._out, self._options, self._screen = config, emulation, out, options, screen
+        self._done = RUNS / "cells" / f"{config.digest}.ok"  # there once a run with this calibration ended well
+        self._speed = options.speed or (1.0 if self._done.exists() else config.first_run_speed)
+
+    def run(self) -> None:
+        station = Station(self._config)
+        if self._options.dry_run:
+            self._prepare(station)
+            return
+        with station:
+            self._park(station)
+            motion, record = self._prepare(station)
+            seconds = len(motion.joints) / station.rate_hz
+            self._confirm(f"execute {seconds:.0f} s of motion at {100 * self._speed:.0f}% of the usual speed?")
+            with self._screen.stage("execution"), stop_on_signals() as stop:
+                played = station.play(motion, stop)
+            names = [arm.name for arm in station.arms]
+            played.path.save(self._out / MEASURED_FILE)
+            failure = played.stopped or "; ".join(played.path.empty_grasps(names)) or self._judge()
+            self._report(record, not failure, f"failed: {failure}" if failure else "success")
+            if played.stopped:
+                raise StoppedError(f"{played.stopped}; the arms hold their position")
+        if not failure:
+            write_whole(self._done, b"")
+
+    def _park(self, station: Station) -> None:
+        if is_parked(station):
+            return
+        self._confirm("the arms are not at their park pose; move them there slowly?")
+        with self._screen.stage("park"), stop_on_signals() as stop:
+            played = park(station, stop, min(self._speed, self._config.first_run_speed))
+        if played.stopped:
+            raise StoppedError(f"{played.stopped}; the arms hold their position")
+
+    def _prepare(self, station: Station) -> tuple[Motion, RunRecord]:
+        """A checked motion, and what is known of the run; the page shows the plan already."""
+        record = RunRecord.load(self._out) if self._options.plan else self._plan()
+        plan = Plan.load(self._out / PLAN_FILE)
+        page = write_report(self._out)
+        self._screen.say(f"the plan, with a confidence of {plan.confidence or 0.0:.2f}: {page}")
+        require_trust(self._config, plan.confidence, plan.cell)
+        with self._screen.stage("check of the motion"):
+            motion = plan_guarded(
+                plan.trajectory,
+                station.arms,
+                self._config.limits,
+                self._config.execute_hz,
+                self._config.rate_hz,
+                self._speed,
+            )
+        return motion, record
+
+    def _plan(self) -> RunRecord:
+        """Take an image and plan; image, plan and context lie in the run folder then."""
+        demonstrations = load_demonstrations(self._options.demos)
+        seen = self._observation()
+        with self._screen.stage(f"language model ({self._options.llm})"):
+            model = connect(self._options.llm)
+        settings = method_settings(self._options)
+        try:
+            policy = RobustInstantPolicy(
+                model,
+                settings,
+                num_queries=self._options.queries,
+                deadline_s=self._options.deadline,
+                progress=self._screen.done_so_far,
+                workspace=self._config.limits.workspace,
+            )
+            with self._screen.stage("keypoints of the demonstrations"):
+                policy.fit(demonstrations)
+            with self._screen.stage("plan"):
+                plan = replace(policy.plan(seen), cell=self._config.digest)
+        finally:
+            model.close()
+        seen.save(self._out / SEEN_FILE)
+        plan.save(self._out / PLAN_FILE)
+        save_context(self._out, [one.observation.rgb for one in demonstrations], policy.context_.pixels)
+        (self._out / MEASURED_FILE).unlink(missing_ok=True)  # of an earlier run
+        for note in plan.notes:
+            self._screen.say(f"    {note}")
+        task = demonstrations[0].task or self._config.name
+        record = RunRecord(
+            task, task, None, model.name, policy.name, None, "planned, not executed", tuple(self._screen.stages)
+        )
+        record.save(self._out)
+        return record
+
+    def _observation(self) -> Observation:
+        if self._config.camera is None:
+            raise UsageError(f"{self._config.path} has no table [camera]")
+        camera = make_camera(self._config.camera, self._config.path.parent)
+        with self._screen.stage(f"image of camera {camera.name}"):
+            camera.connect()
+            try:
+                return observe(self._config, camera)
+            finally:
+                camera.disconnect()
+
+    def _judge(self) -> str:
+        """Why the task is not done, empty if it is: from the emulation, or from the person."""
+        if self._emulation is not None:
+            return self._emulation.failure()
+        if self._options.yes:
+            return ""
+        return "" if _agrees("did it succeed?") else "judged a failure"
+
+    def _report(self, record: RunRecord, success: bool, outcome: str) -> None:
+        replace(record, success=success, outcome=outcome, stages=tuple(self._screen.stages)).save(self._out)
+        self._screen.say(outcome)
+        self._screen.say(f"report: {write_report(self._out)}")
+
+    def _confirm(self, question: str) -> None:
+        """Raises `StoppedError` unless the person, or the option ``--yes``, agrees."""
+        if not self._options.yes and not _agrees(question):
+            raise StoppedError("nothing was executed")
+
+
+def _agrees(question: str) -> bool:
+    if not sys.stdin.isatty():
+        raise UsageError("there is no terminal to ask on; use --yes to execute without asking")
+    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+
+
+def _share(text: str) -> float:
+    """A share of the usual speed."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.05 <= value <= 1.0:
+        raise argparse.ArgumentTypeError(f"must be from 0.05 to 1, not {text!r}")
+    return value

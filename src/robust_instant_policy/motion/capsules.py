@@ -1,0 +1,116 @@
+"""Arms as capsules, and distances between capsules.
+
+A capsule is the set of points within a radius of a line segment. Each shape of an arm's model is enclosed in one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robust_instant_policy.geometry import FloatArray, transform_points
+from robust_instant_policy.motion.kinematics import Kinematics
+
+LINES = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
+SMALLEST = 1e-12  # squared length of a segment, m², below which it is a point
+
+
+@dataclass(frozen=True, eq=False)
+class Capsules:
+    """Segments from ``start (..., C, 3)`` to ``stop (..., C, 3)``, metres, with ``radius (C,)``."""
+
+    start: FloatArray
+    stop: FloatArray
+    radius: FloatArray
+
+    def distances(self, other: Capsules) -> FloatArray:
+        """Distances ``(..., C, D)`` between the surfaces of these capsules and those of ``other``, negative inside."""
+        apart = segment_distance(
+            self.start[..., :, None, :],
+            self.stop[..., :, None, :],
+            other.start[..., None, :, :],
+            other.stop[..., None, :, :],
+        )
+        return apart - self.radius[:, None] - other.radius
+
+    def lowest(self) -> FloatArray:
+        """Height ``(..., C)`` of the lowest point of each, metres."""
+        return np.minimum(self.start[..., 2], self.stop[..., 2]) - self.radius
+
+
+def segment_distance(a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike) -> FloatArray:
+    """Distance ``(...)`` between the segments from ``a`` to ``b`` and from ``c`` to ``d (..., 3)``.
+
+    The closest points of the two lines, clamped to the segments one after the other (Ericson 2005, Sec. 5.1.9).
+    """
+    a, c = np.asarray(a, dtype=np.float64), np.asarray(c, dtype=np.float64)
+    along, other, offset = np.asarray(b) - a, np.asarray(d) - c, a - c
+
+    def dot(x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.einsum("...i,...i->...", x, y)
+
+    aa, bb, ab = dot(along, along), dot(other, other), dot(along, other)
+    ra, rb = dot(along, offset), dot(other, offset)
+    aa, bb = np.maximum(aa, SMALLEST), np.maximum(bb, SMALLEST)
+    determinant = np.maximum(aa * bb - ab**2, SMALLEST)
+    s = np.clip((ab * rb - ra * bb) / determinant, 0.0, 1.0)
+    t = np.clip((ab * s + rb) / bb, 0.0, 1.0)
+    s = np.clip((ab * t - ra) / aa, 0.0, 1.0)
+    return np.linalg.norm(offset + s[..., None] * along - t[..., None] * other, axis=-1)
+
+
+class ArmShape:
+    """The links of an arm as capsules, for any joint angles.
+
+    ``near_table (C,)`` is False for links that only turn about the arm's first joint: they stand on the table;
+    ``hand (C,)`` marks those beyond the last joint, which work at the table.
+    """
+
+    def __init__(self, kinematics: Kinematics):
+        model = kinematics.model
+        self._model, self._data, self._base = model, mujoco.MjData(model), kinematics.base
+        self._num_joints = kinematics.num_joints
+        depth = np.array([_joints_above(model, body, self._num_joints) for body in range(model.nbody)])
+        self._geoms = np.flatnonzero(depth[model.geom_bodyid] >= 1)
+        self.near_table = depth[model.geom_bodyid[self._geoms]] >= 2
+        self.hand = depth[model.geom_bodyid[self._geoms]] >= self._num_joints
+        shapes = [_enclosing(model, geom) for geom in self._geoms]
+        self._local = np.array([(start, stop) for start, stop, _ in shapes]).reshape(-1, 2, 3)
+        self.radius = np.array([radius for _, _, radius in shapes])
+
+    def at(self, joints: ArrayLike) -> Capsules:
+        """The capsules ``(N, C)`` in the world at ``joints (N, J)``."""
+        joints = np.atleast_2d(np.asarray(joints, dtype=np.float64))
+        ends = np.empty((len(joints), len(self._geoms), 2, 3))
+        for row, angles in enumerate(joints):
+            self._data.qpos[: self._num_joints] = angles
+            mujoco.mj_kinematics(self._model, self._data)
+            rotation = self._data.geom_xmat[self._geoms].reshape(-1, 3, 3)
+            ends[row] = self._local @ rotation.swapaxes(1, 2) + self._data.geom_xpos[self._geoms, None]
+        ends = transform_points(self._base, ends)
+        return Capsules(ends[:, :, 0], ends[:, :, 1], self.radius)
+
+
+def _joints_above(model: mujoco.MjModel, body: int, num_joints: int) -> int:
+    """How many of the arm's joints move ``body``."""
+    count = 0
+    while body:
+        first, number = model.body_jntadr[body], model.body_jntnum[body]
+        count += sum(joint < num_joints for joint in range(first, first + number))
+        body = model.body_parentid[body]
+    return count
+
+
+def _enclosing(model: mujoco.MjModel, geom: int | np.integer) -> tuple[FloatArray, FloatArray, float]:
+    """A capsule around a shape, in its frame: both ends ``(3,)`` and the radius."""
+    size = model.geom_size[geom]
+    if model.geom_type[geom] in LINES:
+        half = np.array([0.0, 0.0, size[1]])
+        return -half, half, float(size[0])
+    middle, extent = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    axis = int(np.argmax(extent))
+    half = np.eye(3)[axis] * extent[axis]
+    return middle - half, middle + half, float(np.linalg.norm(np.delete(extent, axis)))

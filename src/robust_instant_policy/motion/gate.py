@@ -1,0 +1,139 @@
+"""The last check before a command leaves, and the watch over what the arms measure.
+
+Everything that moves an arm goes through a `Gate`: executed plans (`admit` refuses) and a person's leader (`limited`
+slows down). `judge` looks at the measured states.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from robust_instant_policy.errors import StoppedError, UnreachableError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.arm import Arm
+from robust_instant_policy.motion.guard import Space, check_joint_range
+from robust_instant_policy.motion.limits import Limits, exceeded
+from robust_instant_policy.motion.state import ArmState, Command
+
+TOLERANCE = 1.05  # of speeds and accelerations that were planned at the limit
+STALE_S = 0.1  # without a new reading; the watchdog's time
+BLOCKED_S = 1.5  # that a gripper may take to open
+BLOCKED_SHARE = 0.3  # of its travel that it may lack then
+
+
+class Gate:
+    """Checks commands for A arms at ``rate_hz``, and their states.
+
+    `start` must be called with measured states before the first command. All quantities that depend on time count
+    control steps, so that a change of the system's clock has no effect.
+    """
+
+    def __init__(self, arms: Sequence[Arm], limits: Limits, rate_hz: float):
+        self._arms, self._limits, self._rate = arms, limits, rate_hz
+        self._space = Space(arms, limits)
+        self._speed = np.array([arm.joint_speed for arm in arms])[:, None] / rate_hz
+        self._acceleration = np.array([arm.joint_acceleration for arm in arms])[:, None] / rate_hz**2
+
+    def start(self, states: Sequence[ArmState]) -> None:
+        """Take the measured joints as the last command; raises `StoppedError` if the arms are not ready."""
+        self._clocks, self._stale, self._opening = [-math.inf] * len(states), [0] * len(states), [0] * len(states)
+        self._last: list[Command] = [Command(state.joints, state.finger_travel) for state in states]
+        self._change = np.zeros((len(states), len(states[0].joints)))
+        self.judge(states)
+
+    @property
+    def last(self) -> Sequence[Command]:
+        """The last command of each arm."""
+        return self._last
+
+    def admit(self, commands: Sequence[Command]) -> Sequence[Command]:
+        """Return ``commands``; raises `UnreachableError` if one is not a number, out of range, too fast or a jump."""
+        joints = np.stack([command.joints for command in commands])
+        fingers = np.array([command.finger_travel for command in commands])
+        change = joints - np.stack([command.joints for command in self._last])
+        for index, arm in enumerate(self._arms):
+            if not (np.isfinite(joints[index]).all() and np.isfinite(fingers[index])):
+                raise UnreachableError(f"{arm.name}: a command is not a number; nothing was sent")
+            if not -1e-6 <= fingers[index] <= arm.finger_travel + 1e-6:
+                what = "the fingers are told to open by"
+                raise UnreachableError(exceeded(arm.name, what, fingers[index], arm.finger_travel, "m", "gripper"))
+            check_joint_range(joints[index : index + 1], arm, self._rate)
+            for values, limit, order, what, unit, key in (
+                (change[index], arm.joint_speed, 1, "a joint is told to move at", "rad/s", "joint_speed"),
+                (change[index] - self._change[index], arm.joint_acceleration, 2, "a joint is told to accelerate by",
+                 "rad/s²", "joint_acceleration"),
+            ):  # fmt: skip
+                value = float(np.abs(values).max()) * self._rate**order
+                if value > limit * TOLERANCE:
+                    raise UnreachableError(exceeded(arm.name, what, value, limit, unit, key))
+        self._last, self._change = list(commands), change
+        return commands
+
+    def limited(self, wanted: Sequence[Command]) -> list[Command]:
+        """What the arms may do towards ``wanted``: within speeds, accelerations and ranges, or not at all.
+
+        Where the next step would bring a tool out of the workspace or a link to the table or the other arm, all arms
+        keep their last command.
+        """
+        last = np.stack([command.joints for command in self._last])
+        joints = np.stack([command.joints for command in wanted])
+        fingers = np.array([command.finger_travel for command in wanted])
+        if not (np.isfinite(joints).all() and np.isfinite(fingers).all()):
+            raise StoppedError("a leader reports positions that are not numbers; check its cables and calibration")
+        low, high = np.stack([arm.kinematics.joint_range for arm in self._arms]).transpose(2, 0, 1)
+        change = _braked(joints.clip(low, high) - last, self._change, self._speed, self._acceleration)
+        after = (last + change).clip(low, high)
+        try:
+            self._space.check(after[None], self._rate)
+        except UnreachableError:
+            after = last
+        travel = np.array([arm.finger_travel for arm in self._arms])
+        most = np.array([arm.finger_speed for arm in self._arms]) / self._rate
+        before = np.array([command.finger_travel for command in self._last])
+        fingers = before + np.clip(fingers.clip(0.0, travel) - before, -most, most)
+        self._change = after - last
+        self._last = [Command(row, float(opening)) for row, opening in zip(after, fingers, strict=True)]
+        return self._last
+
+    def judge(self, states: Sequence[ArmState]) -> None:
+        """Raise `StoppedError` for states that are no reason to go on: faults, no numbers, stale, far from commanded,
+        or a gripper that does not open."""
+        for index, (arm, state, told) in enumerate(zip(self._arms, states, self._last, strict=True)):
+            if state.faults:
+                raise StoppedError(f"{arm.name} reports: {'; '.join(state.faults)}")
+            if not (np.isfinite(state.joints).all() and np.isfinite(state.finger_travel)):
+                raise StoppedError(f"{arm.name} measures positions that are not numbers; check its cables")
+            self._stale[index] = 0 if state.clock != self._clocks[index] else self._stale[index] + 1
+            self._clocks[index] = state.clock
+            if self._stale[index] > STALE_S * self._rate:
+                raise StoppedError(f"{arm.name} sends the same state for more than {STALE_S:g} s: it is frozen")
+            error = np.abs(state.joints - told.joints)
+            if error.max() > self._limits.following_error:
+                joint = int(np.argmax(error))
+                what = f"joint {joint + 1} is away from its command by"
+                limit = self._limits.following_error
+                blocked = exceeded(arm.name, what, error[joint], limit, "rad", "following_error")
+                raise StoppedError(f"{blocked}; is something in its way, or is it overloaded?")
+            lacks = told.finger_travel - state.finger_travel > BLOCKED_SHARE * arm.finger_travel
+            self._opening[index] = self._opening[index] + 1 if lacks else 0
+            if self._opening[index] > BLOCKED_S * self._rate:
+                raise StoppedError(
+                    f"{arm.name}: the gripper is blocked: told to open to {1e3 * told.finger_travel:.0f} mm, it stands "
+                    f"at {1e3 * state.finger_travel:.0f} mm; free it and check its cable"
+                )
+
+
+def _braked(wanted: FloatArray, before: FloatArray, speed: FloatArray, acceleration: FloatArray) -> FloatArray:
+    """The change ``(A, J)`` of the next step towards ``wanted``, after a step of ``before``, that can still stop there.
+
+    ``speed`` and ``acceleration`` are limits per step. From a distance d a joint can stop if its step is at most
+    sqrt(2 a d + (a / 2)²) - a / 2.
+    """
+    distance = np.abs(wanted)
+    with np.errstate(invalid="ignore"):
+        stopping = np.sqrt(2 * acceleration * distance + acceleration**2 / 4) - acceleration / 2
+    most = np.fmin(np.fmin(speed, distance), np.where(np.isfinite(acceleration), stopping, np.inf))
+    return np.clip(np.sign(wanted) * most, before - acceleration, before + acceleration)

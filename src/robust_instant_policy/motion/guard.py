@@ -1,0 +1,268 @@
+"""What a real arm needs beyond `waypoints`: a motion within its accelerations, and the checks of the whole path.
+
+plan ──check_waypoints──▶ plan_waypoints ──retimed──▶ check_motion ──▶ the arm
+
+Only commands that passed `check_motion` are sent; `gate.Gate` looks at each of them once more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.errors import UnreachableError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.arm import Arm, Motion
+from robust_instant_policy.motion.capsules import ArmShape
+from robust_instant_policy.motion.checks import gripper_poses
+from robust_instant_policy.motion.limits import Limits, exceeded
+from robust_instant_policy.motion.waypoints import plan_waypoints
+from robust_instant_policy.trajectory import Trajectory
+
+SMOOTHING_S = 0.12  # window of the moving average over joint commands: a jump of the speed is spread over it
+MAX_SLOWDOWN = 4.0  # a motion that needs more than this is not the one that was planned
+ROUNDING, ROUNDING_M = 1 + 1e-6, 1e-6
+HOME_MARGIN_M = 0.05  # around the box of workspace and home, in which an arm comes and goes
+UP_M = 0.10  # of the tool, before an arm goes to its park pose the direct way would be refused
+
+
+def plan_guarded(
+    trajectory: Trajectory,
+    arms: Sequence[Arm],
+    limits: Limits,
+    execute_hz: float,
+    rate_hz: float,
+    speed: float = 1.0,
+) -> Motion:
+    """Motion from the arms' homes along ``trajectory``, slower by the factor ``speed`` (0 to 1), within all limits.
+
+    Raises `UnreachableError` that names the waypoint or the time, the limit, and how to change it.
+    """
+    check_waypoints(trajectory, arms, limits)
+    motion = retimed(plan_waypoints(trajectory, arms, execute_hz, rate_hz), arms, rate_hz, speed)
+    check_motion(motion, arms, limits, rate_hz)
+    return motion
+
+
+def check_waypoints(trajectory: Trajectory, arms: Sequence[Arm], limits: Limits) -> None:
+    """Refuse a trajectory that jumps or turns too far between two waypoints, or leaves the workspace."""
+    poses = gripper_poses(trajectory, arms)
+    changes = poses[:-1, ..., :3, :3].swapaxes(-1, -2) @ poses[1:, ..., :3, :3]
+    turns = Rotation.from_matrix(changes.reshape(-1, 3, 3)).magnitude().reshape(changes.shape[:2])
+    steps = np.linalg.norm(np.diff(poses[..., :3, 3], axis=0), axis=-1)
+    for index, arm in enumerate(arms):
+        _check_workspace(trajectory.triplets[:, index, 1:], arm, limits, None)
+        for values, limit, what, unit, key, scale in (
+            (steps[:, index], limits.step, "moves", "m", "step", 1.0),
+            (turns[:, index], limits.turn_per_step, "turns", "degrees", "turn_per_step", math.degrees(1.0)),
+        ):
+            if (values > limit).any():
+                step = int(np.argmax(values > limit))
+                what = f"the tool {what} to the next one by"
+                raise UnreachableError(
+                    exceeded(_when(arm, step, None), what, values[step] * scale, limit * scale, unit, key)
+                )
+
+
+def retimed(motion: Motion, arms: Sequence[Arm], rate_hz: float, speed: float = 1.0) -> Motion:
+    """``motion`` with smooth speeds, slower by the factor ``speed`` and as far as the arms' limits need.
+
+    Raises `UnreachableError` where it would have to be slower than by `MAX_SLOWDOWN`.
+    """
+    motion = _stretched(_smoothed(motion, rate_hz), 1 / speed)
+    total = 1.0
+    for _ in range(6):
+        needed, reason = _slowdown(motion, arms, rate_hz)
+        if needed <= ROUNDING:
+            return motion
+        total *= needed
+        if total > MAX_SLOWDOWN:
+            break
+        motion = _stretched(motion, needed * 1.02)
+    raise UnreachableError(f"{reason}; the motion would have to be {total:.1f} times slower")
+
+
+def check_motion(motion: Motion, arms: Sequence[Arm], limits: Limits, rate_hz: float) -> None:
+    """Refuse commands that are not finite, or outside the limits of joints, speeds, workspace, table and distances."""
+    if not (np.isfinite(motion.joints).all() and np.isfinite(motion.fingers).all()):
+        raise UnreachableError("the motion holds commands that are not numbers; plan again")
+    needed, reason = _slowdown(motion, arms, rate_hz)
+    if needed > 1.02:
+        raise UnreachableError(reason)
+    for index, arm in enumerate(arms):
+        check_joint_range(motion.joints[:, index], arm, rate_hz)
+    Space(arms, limits).check(motion.joints, rate_hz)
+
+
+def check_joint_range(joints: FloatArray, arm: Arm, rate_hz: float) -> None:
+    """Refuse ``joints (N, J)`` outside the range of the arm's joints."""
+    low, high = arm.kinematics.joint_range.T
+    outside = np.maximum(low - joints, joints - high)
+    if (outside > 1e-6).any():
+        step, joint = np.unravel_index(np.argmax(outside > 1e-6), outside.shape)
+        bound = (low if joints[step, joint] < low[joint] else high)[joint]
+        what = f"joint {joint + 1} goes to"
+        raise UnreachableError(exceeded(_when(arm, step, rate_hz), what, joints[step, joint], bound, "rad", "model"))
+
+
+class Space:
+    """Where arms may be: their tools in the workspace, no link at the table, and apart from each other."""
+
+    def __init__(self, arms: Sequence[Arm], limits: Limits):
+        self._arms, self._limits = arms, limits
+        self._shapes = [ArmShape(arm.kinematics) for arm in arms]
+
+    def check(self, joints: FloatArray, rate_hz: float) -> None:
+        """Refuse ``joints (N, A, J)`` with a tool outside the workspace, a link at the table, or two arms together."""
+        limits = self._limits
+        capsules = [shape.at(joints[:, index]) for index, shape in enumerate(self._shapes)]
+        for index, (arm, shape, links) in enumerate(zip(self._arms, self._shapes, capsules, strict=True)):
+            poses = np.array([arm.kinematics.tool_pose(angles) for angles in joints[:, index]])
+            points = arm.triangle.triplets(poses)[:, 1:]
+            _check_workspace(points, arm, limits, rate_hz)
+            depth = -points[..., 2].min(axis=-1)
+            what = "a fingertip goes"
+            _refuse(depth - limits.table_depth, depth, limits.table_depth, arm, what, "m below the table",
+                    "table_depth", rate_hz)  # fmt: skip
+            # A hand works at the table, where its fingertips were checked; of its other parts the axes stay above it.
+            height = links.lowest() + np.where(shape.hand, links.radius, 0.0)
+            least = height[:, shape.near_table].min(axis=1)
+            _refuse(-least, least, 0.0, arm, "a link has a height above the table of", "m", "model", rate_hz)
+        for one, other in combinations(range(len(self._arms)), 2):
+            apart = capsules[one].distances(capsules[other]).min(axis=(1, 2))
+            what = f"its distance from {self._arms[other].name} is"
+            _refuse(limits.arm_distance - apart, apart, limits.arm_distance, self._arms[one], what, "m",
+                    "arm_distance", rate_hz)  # fmt: skip
+
+
+def joint_motion(start: FloatArray, goal: FloatArray, fingers: FloatArray, arms: Sequence[Arm], rate_hz: float,
+                 speed: float = 1.0) -> Motion:  # fmt: skip
+    """Straight motion of joints ``(A, J)`` from ``start`` to ``goal`` with a minimum-jerk profile, fingers at rest."""
+    peak = 1.875  # of the speed of a minimum-jerk motion over its mean
+    seconds = max(float((peak * np.abs(goal - start).max(axis=1) / [arm.joint_speed for arm in arms]).max()), 0.2)
+    share = np.linspace(0.0, 1.0, max(math.ceil(seconds * rate_hz / speed), 2) + 1)[1:, None, None]
+    share = share**3 * (10 - 15 * share + 6 * share**2)
+    joints = start + share * (goal - start)
+    poses = np.stack(
+        [[arm.kinematics.tool_pose(row) for row in joints[:, index]] for index, arm in enumerate(arms)], axis=1
+    )
+    count = (len(joints), 1)
+    return Motion(joints, np.tile(fingers, count), poses, np.tile(fingers <= 0.0, count))
+
+
+def park_motion(start: FloatArray, fingers: FloatArray, arms: Sequence[Arm], limits: Limits, rate_hz: float,
+                speed: float = 1.0) -> Motion:  # fmt: skip
+    """Motion from joints ``start (A, J)`` to the arms' homes: directly, or up first where that would be refused.
+
+    Fingers keep their travel ``fingers (A,)``. Raises `UnreachableError` where both ways are refused.
+    """
+    home = np.stack([arm.home for arm in arms])
+    direct = retimed(joint_motion(start, home, fingers, arms, rate_hz), arms, rate_hz, speed)
+    try:
+        check_motion(direct, arms, limits, rate_hz)
+        return direct
+    except UnreachableError as refused:
+        raised = []
+        for arm, joints in zip(arms, start, strict=True):
+            pose = arm.kinematics.tool_pose(joints)
+            path = np.repeat(pose[None], 11, axis=0)
+            path[:, 2, 3] += np.linspace(0.0, UP_M, 11)
+            raised.append(arm.kinematics.follow(path, joints).joints[-1])
+        up = np.stack(raised)
+        parts = [joint_motion(start, up, fingers, arms, rate_hz), joint_motion(up, home, fingers, arms, rate_hz)]
+        detour = Motion(*(np.concatenate([getattr(part, name) for part in parts]) for name in _FIELDS))
+        detour = retimed(detour, arms, rate_hz, speed)
+        try:
+            check_motion(detour, arms, limits, rate_hz)
+        except UnreachableError:
+            raise UnreachableError(f"the way to the park pose is refused ({refused}); move the arm by hand") from None
+        return detour
+
+
+_FIELDS = ("joints", "fingers", "poses", "closed")
+
+
+def _smoothed(motion: Motion, rate_hz: float) -> Motion:
+    """Joint commands after a moving average; the motion ends later by its window."""
+    window = 2 * round(SMOOTHING_S * rate_hz / 2) + 1
+    held = {name: getattr(motion, name) for name in _FIELDS}
+    held = {name: np.concatenate([values, np.repeat(values[-1:], window, axis=0)]) for name, values in held.items()}
+    joints = uniform_filter1d(held["joints"], window, axis=0, mode="nearest")
+    return replace(motion, **{**held, "joints": joints})
+
+
+def _stretched(motion: Motion, factor: float) -> Motion:
+    """``motion`` over ``factor`` times as many control steps."""
+    count = len(motion.joints)
+    if count < 2 or factor == 1.0:
+        return motion
+    position = np.linspace(0, count - 1, math.ceil((count - 1) * factor) + 1)
+    nearest = np.ceil(position - 1e-9).astype(int)
+    fingers = [np.interp(position, np.arange(count), column) for column in motion.fingers.T]
+    return Motion(
+        PchipInterpolator(np.arange(count), motion.joints)(position),
+        np.stack(fingers, axis=1),
+        motion.poses[nearest],
+        motion.closed[nearest],
+    )
+
+
+def _slowdown(motion: Motion, arms: Sequence[Arm], rate_hz: float) -> tuple[float, str]:
+    """The factor by which ``motion`` is too fast, and which limit says so."""
+    worst, reason = 0.0, ""
+    speeds = np.diff(motion.joints, axis=0, prepend=motion.joints[:1], append=motion.joints[-1:]) * rate_hz
+    changes = np.diff(speeds, axis=0) * rate_hz
+    for index, arm in enumerate(arms):
+        tips = np.array([arm.kinematics.tool_pose(joints)[:3, 3] for joints in motion.joints[:, index]])
+        tool = np.linalg.norm(np.diff(tips, axis=0, prepend=tips[:1]), axis=1)[:, None] * rate_hz
+        for values, limit, what, unit, key, order in (
+            (np.abs(speeds[:, index]), arm.joint_speed, "moves a joint at", "rad/s", "joint_speed", 1.0),
+            (np.abs(changes[:, index]), arm.joint_acceleration, "accelerates a joint by", "rad/s²",
+             "joint_acceleration", 0.5),
+            (tool, arm.tool_speed, "moves its tool at", "m/s", "tool_speed", 1.0),
+        ):  # fmt: skip
+            ratio = float(values.max()) / limit
+            if ratio**order > worst:
+                step = int(np.argmax(values.max(axis=1)))
+                worst = ratio**order
+                reason = exceeded(_when(arm, step, rate_hz), what, float(values.max()), limit, unit, key)
+    return worst, reason
+
+
+def _check_workspace(fingertips: FloatArray, arm: Arm, limits: Limits, rate_hz: float | None) -> None:
+    """Refuse ``fingertips (N, 2, 3)`` outside the workspace, but on the way from and to the arm's home."""
+    low, high = limits.workspace[0].copy(), limits.workspace[1]
+    low[2] = min(low[2], -limits.table_depth)  # the table has a limit of its own
+    home = arm.triangle.triplets(arm.home_pose)[1:]
+    outside = np.maximum(low - fingertips, fingertips - high).max(axis=(1, 2))
+    beyond = np.maximum(
+        np.minimum(low, home.min(axis=0)) - HOME_MARGIN_M - fingertips,
+        fingertips - np.maximum(high, home.max(axis=0)) - HOME_MARGIN_M,
+    ).max(axis=(1, 2))
+    inside = np.flatnonzero(outside <= ROUNDING_M)
+    first, last = (inside[0], inside[-1]) if len(inside) else (0, len(fingertips) - 1)
+    excess = np.where((np.arange(len(outside)) > first) & (np.arange(len(outside)) < last), outside, beyond)
+    if excess.max() > ROUNDING_M:
+        step = int(np.argmax(excess))
+        what = "its tool is outside the workspace by"
+        raise UnreachableError(exceeded(_when(arm, step, rate_hz), what, float(excess[step]), 0.0, "m", "workspace"))
+
+
+def _refuse(excess: FloatArray, values: FloatArray, limit: float, arm: Arm, what: str, unit: str, key: str,
+            rate_hz: float) -> None:  # fmt: skip
+    """Raise an error for the first of ``values (N,)`` with an ``excess`` above 0."""
+    if (excess > ROUNDING_M).any():
+        step = int(np.argmax(excess > ROUNDING_M))
+        raise UnreachableError(exceeded(_when(arm, step, rate_hz), what, float(values[step]), limit, unit, key))
+
+
+def _when(arm: Arm, step: int | np.integer, rate_hz: float | None) -> str:
+    """The place of ``step`` in a motion at ``rate_hz``, or among the waypoints of a plan."""
+    return f"{arm.name}, step {step} of the plan" if rate_hz is None else f"{arm.name}, after {step / rate_hz:.1f} s"

@@ -1,0 +1,39 @@
+"""The protocol of an RGB-D camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robust_instant_policy.geometry import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image: ``rgb (H, W, 3)`` uint8; ``depth (H, W)`` float32, metres along the optical axis, aligned to the
+    colour image, 0 or NaN where there is no reading; ``intrinsics (3, 3)`` in pixels, without distortion;
+    ``timestamp`` in seconds of the camera's own clock, which must advance."""
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    intrinsics: FloatArray
+    timestamp: float
+
+
+class Camera(Protocol):
+    """An RGB-D camera. The methods raise `RobotError` when the device does not answer."""
+
+    name: str
+
+    def connect(self) -> None:
+        """Open the device and wait until exposure and depth are stable."""
+        ...
+
+    def read(self) -> Frame:
+        """The next frame, taken after the call."""
+        ...
+
+    def disconnect(self) -> None: ...

@@ -1,0 +1,59 @@
+"""RGB-D cameras, each behind the protocol of `robots.camera`."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+from robust_instant_policy.errors import CellError
+from robust_instant_policy.robots.camera import Camera
+from robust_instant_policy.robots.cameras.lerobot import LeRobotCamera
+from robust_instant_policy.robots.cameras.realsense import RealSenseCamera
+from robust_instant_policy.robots.cameras.recorded import RecordedCamera
+from robust_instant_policy.robots.cell import DeviceConfig
+from robust_instant_policy.robots.emulation.client import EmulatedCamera
+
+__all__ = ["LeRobotCamera", "RealSenseCamera", "RecordedCamera", "make_camera"]
+
+KINDS = ("realsense", "lerobot", "folder", "emulated")
+
+
+def make_camera(config: DeviceConfig, relative_to: Path) -> Camera:
+    """The camera that a cell's file describes, not connected; its paths are ``relative_to`` a folder.
+
+    Raises `CellError` for an unknown kind or key. docs/calibration.md lists the keys of each kind.
+    """
+    section = config.section()
+    camera: Camera
+    if config.kind == "realsense":
+        camera = RealSenseCamera(
+            section.text("serial", ""),
+            section.whole("width", 640, least=1),
+            section.whole("height", 480, least=1),
+            section.whole("rate_hz", 30, least=1),
+        )
+    elif config.kind == "emulated":
+        camera = EmulatedCamera(section.text("url"))
+    elif config.kind == "folder":
+        camera = RecordedCamera(relative_to / section.text("path"))
+    elif config.kind == "lerobot":
+        device = load_factory(section.text("factory"), config.where)
+        camera = LeRobotCamera(
+            section.text("name", "lerobot"),
+            device(),
+            section.array("intrinsics", (3, 3)),
+            section.flag("aligned", False),
+        )
+    else:
+        raise CellError(f"{config.where}: kind must be one of {', '.join(KINDS)}, not {config.kind!r}")
+    section.finish()
+    return camera
+
+
+def load_factory(name: str, where: str):
+    """The callable ``module:name`` that makes a device of one's own."""
+    module, _, attribute = name.partition(":")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise CellError(f"{where}: factory must be module:function of an installed module: {error}") from None

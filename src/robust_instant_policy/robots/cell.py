@@ -1,0 +1,316 @@
+"""The description of a cell: one TOML file that names arms, grippers, camera, workspace and limits.
+
+Lengths are in metres and joint angles in radians; ``turn_per_step`` and the orientation in ``base`` are in degrees.
+``docs/robots.md`` explains each key. File names are relative to the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.errors import CellError, DatasetError
+from robust_instant_policy.files import read_regular
+from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pose
+from robust_instant_policy.motion.checks import TABLE_TOLERANCE_M
+from robust_instant_policy.motion.limits import (
+    ARM_DISTANCE_M,
+    FOLLOWING_ERROR_RAD,
+    STEP_M,
+    TURN_PER_STEP_RAD,
+    Limits,
+)
+
+CELLS = Path(__file__).with_name("cells")  # those that come with the package: emulated ones
+MIN_CONFIDENCE = 0.9  # of a plan; below it `rip run` refuses (docs/trust.md)
+FIRST_RUN_SPEED = 0.25  # share of the usual speed, until a first run in a cell has ended well
+
+
+class Section:
+    """A table of a TOML file whose keys are taken one by one; errors name the file, the key and what it should be."""
+
+    def __init__(self, values: Mapping[str, Any], where: str):
+        self._values, self._where = dict(values), where
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._values
+
+    def text(self, key: str, default: str | None = None, choices: Sequence[str] = ()) -> str:
+        value = self._take(key, default)
+        if not isinstance(value, str) or (choices and value not in choices):
+            raise self.error(key, f"must be {'one of ' + ', '.join(choices) if choices else 'text'}, not {value!r}")
+        return value
+
+    def number(self, key: str, default: float | None = None, least: float = -math.inf, most: float = math.inf) -> float:
+        value = self._take(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
+            raise self.error(key, f"must be a number from {least:g} to {most:g}, not {value!r}")
+        return float(value)
+
+    def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
+        value = self._take(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise self.error(key, f"must be a whole number of at least {least}, not {value!r}")
+        return value
+
+    def flag(self, key: str, default: bool | None = None) -> bool:
+        value = self._take(key, default)
+        if not isinstance(value, bool):
+            raise self.error(key, f"must be true or false, not {value!r}")
+        return value
+
+    def array(self, key: str, shape: tuple[int | None, ...], default: object = None) -> FloatArray:
+        """A finite array; None in ``shape`` stands for any length."""
+        value = self._take(key, default)
+        words = " x ".join("N" if size is None else str(size) for size in shape)
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (ValueError, TypeError):
+            raise self.error(key, f"must be {words} numbers, not {str(value)[:80]}") from None
+        fits = array.ndim == len(shape) and all(
+            want in (size, None) for size, want in zip(array.shape, shape, strict=True)
+        )
+        if not fits or not np.isfinite(array).all():
+            raise self.error(key, f"must be {words} finite numbers, not {str(value)[:80]}")
+        array.flags.writeable = False
+        return array
+
+    def section(self, key: str, default: Mapping[str, Any] | None = None) -> Section:
+        value = self._take(key, default)
+        if not isinstance(value, Mapping):
+            raise self.error(key, f"must be a table, not {value!r}")
+        return Section(value, f"{self._where} {key}".strip())
+
+    def sections(self, key: str) -> list[Section]:
+        value = self._take(key, None)
+        if not isinstance(value, list) or not value or not all(isinstance(one, Mapping) for one in value):
+            raise self.error(key, f"must be one or more tables [[{key}]]")
+        return [Section(one, f"{self._where} {key}[{index}]".strip()) for index, one in enumerate(value)]
+
+    def rest(self) -> Mapping[str, Any]:
+        """What was not taken yet, for a driver that reads it as a `Section` of its own."""
+        values, self._values = self._values, {}
+        return MappingProxyType(values)
+
+    def finish(self) -> None:
+        """Raises `CellError` for a key that nobody took: a misspelt one would be ignored."""
+        for key in self._values:
+            raise self.error(key, "is not known here; is it misspelt?")
+
+    def error(self, key: str, words: str) -> CellError:
+        return CellError(f"{self._where}: {key} {words}")
+
+    def _take(self, key: str, default: Any) -> Any:
+        value = self._values.pop(key, default)
+        if value is None:
+            raise self.error(key, "is missing")
+        return value
+
+
+@dataclass(frozen=True)
+class DeviceConfig:
+    """A device: its ``kind``, which chooses the driver, and the driver's own ``options``, read with `section`."""
+
+    kind: str
+    options: Mapping[str, Any]
+    where: str
+
+    def section(self) -> Section:
+        return Section(self.options, self.where)
+
+    @classmethod
+    def read(cls, section: Section, where: str) -> DeviceConfig:
+        return cls(section.text("kind"), section.rest(), where)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmConfig:
+    """An arm of the cell.
+
+    ``model`` is a known one or the path of a URDF; ``base (4, 4)`` its pose in the world; ``park (J,)`` the joint
+    angles, rad, out of the camera's sight, where a run begins; ``gripper`` None for that of the model, ``tool (4, 4)``
+    measured tool -> tool of the model, None where they are the same;
+    ``joint_speed`` rad/s, ``joint_acceleration`` rad/s² and ``tool_speed`` m/s narrow the model's limits, None leaves
+    them.
+    """
+
+    name: str
+    model: str
+    base: FloatArray
+    park: FloatArray
+    gripper: GripperTriangle | None
+    tool: FloatArray | None
+    driver: DeviceConfig
+    leader: DeviceConfig | None
+    joint_speed: float | None
+    joint_acceleration: float | None
+    tool_speed: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class CellConfig:
+    """A cell, as its file describes it.
+
+    ``rate_hz`` is that of commands, ``execute_hz`` that of a plan's waypoints; ``limits`` holds the workspace and what
+    else a motion must respect; a plan below ``min_confidence`` is refused; ``camera_pose (4, 4)`` is camera to world,
+    OpenCV axes, None before the camera was calibrated; ``emulation`` is the table of an emulated cell, None with real
+    devices. The world's origin lies on the table, z up.
+    """
+
+    path: Path
+    name: str
+    rate_hz: float
+    execute_hz: float
+    limits: Limits
+    min_confidence: float
+    first_run_speed: float
+    arms: tuple[ArmConfig, ...]
+    camera: DeviceConfig | None
+    camera_pose: FloatArray | None
+    camera_calibration: Path | None
+    emulation: Mapping[str, Any] | None = field(default=None)
+
+    def emulation_section(self) -> Section:
+        """The table [emulation]; raises `CellError` for a cell with real devices."""
+        if self.emulation is None:
+            raise CellError(f"{self.path} has no table [emulation]: its devices are real")
+        return Section(self.emulation, f"{self.path}: emulation")
+
+    @property
+    def pace(self) -> float:
+        """How much faster than time the cell runs; 1 for real devices."""
+        return 1.0 if self.emulation is None else float(self.emulation.get("pace", 1.0))
+
+    @property
+    def digest(self) -> str:
+        """Digest of the camera's calibration, the grippers and the arms' bases: a plan holds in the cell it was made
+        for."""
+        parts: list[Any] = [None if self.camera_pose is None else np.round(self.camera_pose, 6).tolist()]
+        for arm in self.arms:
+            gripper = None if arm.gripper is None else [arm.gripper.length, arm.gripper.opening]
+            parts.append([arm.name, arm.model, np.round(arm.base, 6).tolist(), gripper])
+            if arm.tool is not None:
+                parts.append(np.round(arm.tool, 6).tolist())
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
+
+    @classmethod
+    def load(cls, path: str | Path) -> CellConfig:
+        """Read a cell's file, or one of those in `CELLS` by its name. Raises `CellError` in one line that names the
+        key."""
+        path = Path(path)
+        if not path.exists() and (CELLS / f"{path.name}.toml").exists():
+            path = CELLS / f"{path.name}.toml"
+        root = read_section(path)
+        cell = root.section("cell")
+        arms = tuple(_arm(section, path) for section in root.sections("arms"))
+        if len({arm.name for arm in arms}) != len(arms):
+            raise CellError(f"{path}: arms: two arms have the same name")
+        camera, camera_pose, calibration = None, None, None
+        if "camera" in root:
+            section = root.section("camera")
+            if "calibration" in section:
+                calibration = path.parent / section.text("calibration")
+                camera_pose = read_camera_pose(calibration) if calibration.exists() else None
+            camera = DeviceConfig.read(section, f"{path}: camera")
+        emulation = root.section("emulation").rest() if "emulation" in root else None
+        config = cls(
+            path=path,
+            name=cell.text("name", path.stem),
+            rate_hz=cell.number("rate_hz", 50.0, 5.0, 1000.0),
+            execute_hz=cell.number("execute_hz", 1.0, 0.1, 50.0),
+            limits=_limits(cell),
+            min_confidence=cell.number("min_confidence", MIN_CONFIDENCE, 0.0, 1.0),
+            first_run_speed=cell.number("first_run_speed", FIRST_RUN_SPEED, 0.05, 1.0),
+            arms=arms,
+            camera=camera,
+            camera_pose=camera_pose,
+            camera_calibration=calibration,
+            emulation=emulation,
+        )
+        cell.finish()
+        root.finish()
+        return config
+
+
+def read_section(path: Path) -> Section:
+    """A TOML file as a `Section`. Raises `CellError` for one that is missing or is not TOML."""
+    try:
+        return Section(tomllib.loads(read_regular(path).decode()), f"{path}:")
+    except FileNotFoundError:
+        raise CellError(f"no file at {path}; docs/robots.md shows how to write one") from None
+    except (DatasetError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise CellError(f"{path} is not a TOML file: {error}") from None
+
+
+def read_camera_pose(path: Path) -> FloatArray:
+    """``pose (4, 4)``, camera to world, of a calibration file; other keys are the calibration's own."""
+    return read_section(path).array("pose", (4, 4))
+
+
+def read_gripper(path: Path) -> GripperTriangle:
+    """``length`` and ``opening``, metres, of a gripper's file; other keys are the calibration's own."""
+    return _gripper(read_section(path))
+
+
+def read_tool(path: Path) -> FloatArray | None:
+    """``tool (4, 4)`` of a gripper's file, measured tool -> tool of the arm's model; None without it."""
+    section = read_section(path)
+    return section.array("tool", (4, 4)) if "tool" in section else None
+
+
+def _gripper(section: Section) -> GripperTriangle:
+    return GripperTriangle(
+        section.number("length", least=0.002, most=1.0), section.number("opening", least=0.002, most=0.5)
+    )
+
+
+def _limits(cell: Section) -> Limits:
+    workspace = cell.array("workspace", (2, 3))
+    if not (workspace[0] < workspace[1]).all():
+        raise cell.error("workspace", "must be the lower and then the upper corner, [[x, y, z], [x, y, z]] in metres")
+    return Limits(
+        workspace,
+        table_depth=cell.number("table_depth", TABLE_TOLERANCE_M, 0.0, 0.05),
+        arm_distance=cell.number("arm_distance", ARM_DISTANCE_M, 0.0, 1.0),
+        turn_per_step=math.radians(cell.number("turn_per_step", math.degrees(TURN_PER_STEP_RAD), 1.0, 180.0)),
+        step=cell.number("step", STEP_M, 0.01, 2.0),
+        following_error=cell.number("following_error", FOLLOWING_ERROR_RAD, 0.01, 2.0),
+    )
+
+
+def _arm(section: Section, path: Path) -> ArmConfig:
+    name = section.text("name")
+    base = section.array("base", (6,), [0.0] * 6)
+    gripper = tool = None
+    if "gripper" in section:
+        file = path.parent / section.text("gripper")
+        gripper, tool = read_gripper(file), read_tool(file)
+    config = ArmConfig(
+        name=name,
+        model=section.text("model"),
+        base=make_pose(Rotation.from_euler("xyz", base[3:], degrees=True).as_matrix(), base[:3]),
+        park=section.array("park", (None,)),
+        gripper=gripper,
+        tool=tool,
+        driver=DeviceConfig.read(section.section("driver"), f"{path}: driver of {name}"),
+        leader=DeviceConfig.read(section.section("leader"), f"{path}: leader of {name}")
+        if "leader" in section
+        else None,
+        **{key: _optional(section, key) for key in ("joint_speed", "joint_acceleration", "tool_speed")},
+    )
+    section.finish()
+    return config
+
+
+def _optional(section: Section, key: str) -> float | None:
+    return section.number(key, least=1e-3, most=100.0) if key in section else None

@@ -1,0 +1,67 @@
+"""What stands between a camera, a plan and a motion of real arms: the checks that refuse."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.errors import CellError, RobotError, StoppedError
+from robust_instant_policy.motion.guard import park_motion
+from robust_instant_policy.robots.camera import Camera
+from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.signals import StopRequest
+from robust_instant_policy.robots.station import START_RAD, Played, Station
+
+MIN_DEPTH_SHARE = 0.2  # of the pixels of an image; fewer, and the camera is covered or too close
+
+
+def observe(config: CellConfig, camera: Camera) -> Observation:
+    """The start image with the cell's calibration.
+
+    Raises `RobotError` for a camera that repeats its image or has no depth, `CellError` without a calibration.
+    """
+    if config.camera_pose is None:
+        raise CellError(
+            f"{config.path}: the camera is not calibrated; run: rip calibrate camera, see docs/calibration.md"
+        )
+    before, frame = camera.read(), camera.read()
+    if frame.timestamp == before.timestamp:
+        raise RobotError(f"camera {camera.name} repeats its image: it is frozen; unplug it, plug it in, and run again")
+    share = float((np.isfinite(frame.depth) & (frame.depth > 0)).mean())
+    if share < MIN_DEPTH_SHARE:
+        raise RobotError(
+            f"camera {camera.name}: {100 * share:.0f}% of the pixels have depth, at least {100 * MIN_DEPTH_SHARE:.0f}% "
+            "are needed; uncover it, or move it farther away"
+        )
+    return Observation(frame.rgb, frame.depth, frame.intrinsics, config.camera_pose)
+
+
+def require_trust(config: CellConfig, confidence: float | None, cell: str) -> None:
+    """Raises `StoppedError` for a plan with too low a ``confidence``, or one that was made for another ``cell``."""
+    if cell != config.digest:
+        raise StoppedError(
+            "the plan was made for another calibration, gripper or cell"
+            + ("" if cell else " (it names none)")
+            + f"; this one is {config.digest}: plan again here"
+        )
+    if confidence is None or confidence < config.min_confidence:
+        value = "none" if confidence is None else f"{confidence:.2f}"
+        raise StoppedError(
+            f"the plan's confidence is {value}, the limit is {config.min_confidence:.2f} (min_confidence in the cell's "
+            "file, docs/trust.md); record more demonstrations, or look at the page for the reason"
+        )
+
+
+def is_parked(station: Station) -> bool:
+    """Whether all arms are where a plan begins."""
+    states = station.states()
+    away = [np.abs(state.joints - arm.home).max() for state, arm in zip(states, station.arms, strict=True)]
+    return max(away) <= START_RAD
+
+
+def park(station: Station, stop: StopRequest, speed: float) -> Played:
+    """Move all arms to their park poses; raises `UnreachableError` where the way is refused."""
+    states = station.states()
+    joints = np.stack([state.joints for state in states])
+    fingers = np.array([state.finger_travel for state in states]).clip(0.0, [arm.finger_travel for arm in station.arms])
+    return station.play(park_motion(joints, fingers, station.arms, station.config.limits, station.rate_hz, speed), stop)

@@ -1,0 +1,39 @@
+"""The protocol of an arm that executes commands."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from robust_instant_policy.motion.state import ArmState, Command
+
+__all__ = ["ArmState", "Command", "Follower"]
+
+
+class Follower(Protocol):
+    """An arm with a gripper that follows joint commands.
+
+    The methods raise `RobotError` within 100 ms when the device does not answer. Tool poses become joint commands
+    through `motion.kinematics`; see `robots.models.arm_of`.
+    """
+
+    name: str
+
+    def connect(self) -> None:
+        """Open the device, check that it is the configured one, and hold the present position. Nothing moves."""
+        ...
+
+    def state(self) -> ArmState:
+        """The present state, read from the device."""
+        ...
+
+    def command(self, command: Command) -> None:
+        """Go on to ``command``, one control step ahead. Returns without waiting for the motion."""
+        ...
+
+    def stop(self) -> None:
+        """Come to rest at once and hold the position; the torque stays on. Never raises, may be called twice."""
+        ...
+
+    def disconnect(self) -> None:
+        """Close the device. The arm holds its position: it must not fall onto the table."""
+        ...

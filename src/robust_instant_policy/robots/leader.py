@@ -1,0 +1,29 @@
+"""The protocol of a device that a person moves to command a follower."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from robust_instant_policy.robots.follower import ArmState, Command
+
+
+class Leader(Protocol):
+    """Commands one follower. The methods raise `RobotError` when the device does not answer."""
+
+    name: str
+
+    def connect(self) -> None: ...
+
+    def start(self) -> None:
+        """Called before leading begins: where the leader was before does not matter."""
+        ...
+
+    def read(self, follower: ArmState) -> Command:
+        """The command for the follower now.
+
+        A leader arm returns its own joints; a keyboard or gamepad moves on from its last command, at first from
+        the state of the ``follower``.
+        """
+        ...
+
+    def disconnect(self) -> None: ...

@@ -1,0 +1,65 @@
+"""A leader with the joints of its follower: GELLO, ALOHA's leader arms, any `Teleoperator` of LeRobot."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from robust_instant_policy.errors import RobotError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.state import ArmState, Command
+from robust_instant_policy.robots.leaders.joint_map import JointMap
+
+MAX_STEP_RAD = 1.0  # between two readings; a servo that restarted jumps by more
+
+
+class JointSource(Protocol):
+    """A device with S angles. The methods raise `RobotError` when it does not answer."""
+
+    name: str
+
+    def connect(self) -> None: ...
+
+    def angles(self) -> FloatArray:
+        """Readings ``(S,)`` rad."""
+        ...
+
+    def disconnect(self) -> None: ...
+
+
+class ArmLeader:
+    """See `robots.leader.Leader`; ``finger_travel`` is the follower's, metres.
+
+    Servos count turns from where they are switched on. So whole turns are chosen at the first reading after `start`,
+    as near as possible to the follower's joints, and followed from there.
+    """
+
+    def __init__(self, source: JointSource, joints: JointMap, finger_travel: float):
+        self.name, self._source, self._map, self._travel = source.name, source, joints, finger_travel
+        self._last: FloatArray | None = None
+
+    def connect(self) -> None:
+        self._source.connect()
+
+    def start(self) -> None:
+        self._last = None
+
+    def read(self, follower: ArmState) -> Command:
+        readings = self._source.angles()
+        if not np.isfinite(readings).all():
+            raise RobotError(f"{self.name} reads angles that are not numbers; check its cables")
+        angles = self._map.joints(readings)
+        near = follower.joints if self._last is None else self._last
+        angles = angles - 2 * np.pi * np.round((angles - near) / (2 * np.pi))
+        if self._last is not None and np.abs(angles - self._last).max() > MAX_STEP_RAD:
+            joint = int(np.abs(angles - self._last).argmax())
+            raise RobotError(
+                f"{self.name}: joint {joint + 1} jumped by {np.degrees(angles[joint] - self._last[joint]):.0f} degrees "
+                "between two readings; its servo restarted or slipped: check the power supply, and begin again"
+            )
+        self._last = angles
+        return Command(angles, self._map.opening(readings) * self._travel)
+
+    def disconnect(self) -> None:
+        self._source.disconnect()

@@ -1,0 +1,84 @@
+"""What was commanded and what was measured, and what a gripper's width and force say about a grasp."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from robust_instant_policy.errors import DatasetError
+from robust_instant_policy.files import open_regular, write_whole
+from robust_instant_policy.geometry import FloatArray
+
+EMPTY_TRAVEL_M = 1.5e-3  # of each finger: less than this is left between closed fingers that hold nothing
+EMPTY_LOAD = 0.5  # share of the force limit; fingers that press on something thin use more
+CLOSING_S = 0.4  # of a closed command before the width is judged
+CLOSED_M = 1e-6
+
+ARRAYS = ("rate_hz", "commanded", "measured", "commanded_tools", "measured_tools", "loads", "seconds")
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPath:
+    """A run at ``rate_hz``: ``commanded`` and ``measured (N, A, J + 1)`` joints, rad, and finger travel, metres;
+    ``commanded_tools`` and ``measured_tools (N, A, 3)``, the points between the fingertips, metres in the world;
+    ``loads (N, A)`` of the grippers, 0 to 1; ``seconds (N,)`` since the start, of the machine's clock."""
+
+    rate_hz: float
+    commanded: FloatArray
+    measured: FloatArray
+    commanded_tools: FloatArray
+    measured_tools: FloatArray
+    loads: FloatArray
+    seconds: FloatArray
+
+    def save(self, path: Path) -> None:
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **{name: getattr(self, name) for name in ARRAYS})
+        write_whole(path, buffer.getvalue())
+
+    @classmethod
+    def load(cls, path: Path) -> MeasuredPath:
+        """Raises `DatasetError` for a file that is not a measured path."""
+        try:
+            with open_regular(path) as file, np.load(file, allow_pickle=False) as arrays:
+                values = {name: arrays[name] for name in ARRAYS}
+            return cls(float(values.pop("rate_hz")), **values)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DatasetError(f"{path} is not a measured path: {error}") from None
+
+    @property
+    def worst_following_error(self) -> float:
+        """Largest difference, rad, between a commanded and a measured joint."""
+        return float(np.abs(self.commanded - self.measured)[..., :-1].max(initial=0.0))
+
+    @property
+    def tool_errors(self) -> FloatArray:
+        """Distances ``(N, A)``, metres, between commanded and measured tools."""
+        return np.linalg.norm(self.commanded_tools - self.measured_tools, axis=-1)
+
+    @property
+    def jitter(self) -> FloatArray:
+        """Deviation ``(N - 1,)``, seconds, of the time between two commands from that of the rate."""
+        return np.abs(np.diff(self.seconds) - 1 / self.rate_hz)
+
+    def empty_grasps(self, names: Sequence[str]) -> list[str]:
+        """One line for each time that a gripper closed and held nothing."""
+        lines = []
+        for arm, name in enumerate(names):
+            closed = self.commanded[:, arm, -1] <= CLOSED_M
+            starts = np.flatnonzero(np.diff(closed.astype(int), prepend=0) == 1)
+            for start in starts:
+                judged = start + round(CLOSING_S * self.rate_hz)
+                if judged < len(closed) and closed[start : judged + 1].all():
+                    travel, load = self.measured[judged, arm, -1], self.loads[judged, arm]
+                    if travel < EMPTY_TRAVEL_M and load < EMPTY_LOAD:
+                        seconds = start / self.rate_hz
+                        lines.append(
+                            f"the gripper {name} closed on nothing after {seconds:.1f} s: {2e3 * travel:.1f} mm "
+                            f"between its fingers, {100 * load:.0f}% of its force"
+                        )
+        return lines

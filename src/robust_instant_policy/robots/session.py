@@ -1,0 +1,160 @@
+"""A session of recording: one demonstration after another into a dataset folder.
+
+park ─▶ start image ─▶ soft start ─▶ demonstration ─▶ kept or discarded ─▶ park …
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import DatasetError, StoppedError
+from robust_instant_policy.files import read_regular, write_whole
+from robust_instant_policy.robots.camera import Camera
+from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.execution import is_parked, observe, park
+from robust_instant_policy.robots.journal import Episode, Journal
+from robust_instant_policy.robots.leader import Leader
+from robust_instant_policy.robots.operator import ENTER, Operator
+from robust_instant_policy.robots.recording import DISCARD, QUIT, demonstration_of, teach
+from robust_instant_policy.robots.station import Station
+from robust_instant_policy.sanity import check_demonstrations
+
+PREVIEW = "p"
+LATE_S = 5e-3  # deviation of a step that 95% of the steps must keep within
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """What is needed to record demonstrations of a task; all devices are connected.
+
+    ``writer`` is of the folder; ``preview(observation)`` writes a page with the keypoints found in a start image;
+    ``next_scene()`` prepares an emulated scene and returns its seed, None where a person arranges it.
+    """
+
+    station: Station
+    leaders: Sequence[Leader]
+    camera: Camera
+    writer: DatasetWriter
+    operator: Operator
+    preview: Callable[[Observation], object]
+    next_scene: Callable[[], int] | None = None
+
+    def record(self, count: int) -> None:
+        """Record until the folder holds ``count`` demonstrations, or the person ends it.
+
+        Raises `RobotError` or `StoppedError` where an arm or a device stops; the episode under way is kept.
+        """
+        keep_calibration(self.station.config, self.writer.path)
+        journal = Journal(self.writer.path)
+        self._take_up(journal)
+        while self.writer.num_episodes < count:
+            self._park()
+            seed = None if self.next_scene is None else self.next_scene()
+            start = self._start(f"demonstration {self.writer.num_episodes + 1} of {count}")
+            if start is None:
+                return
+            episode, key = teach(self.station, self.leaders, start, journal, self.operator)
+            if not key:
+                raise StoppedError(
+                    f"{self.operator.stop.reason}; the arms hold; the episode of {len(episode.steps)} steps is kept"
+                )
+            if key == ENTER:
+                self._store(episode, journal, seed)
+            else:
+                self._discard(journal, seed)
+            if key == QUIT:
+                return
+
+    def _start(self, words: str) -> Observation | None:
+        """The start image, once the person is ready to lead; None to end."""
+        operator = self.operator
+        arrange = f"{words}: arrange the scene, hands out of the image; Enter photographs it, q ends"
+        if operator.ask(arrange, ENTER + QUIT) != ENTER:
+            return None
+        start = observe(self.station.config, self.camera)
+        while True:
+            hold = "hold the leader near its follower's pose; Enter couples both, p shows keypoints, q ends"
+            key = operator.ask(hold, ENTER + PREVIEW + QUIT)
+            if key != PREVIEW:
+                return start if key == ENTER else None
+            self.preview(start)
+
+    def _store(self, episode: Episode, journal: Journal, seed: int | None) -> None:
+        """Add the episode if the person wants it, and say at once what `rip check` finds."""
+        operator, station = self.operator, self.station
+        try:
+            demonstration = self._demonstration(episode, seed)
+        except DatasetError as error:
+            operator.say(f"  {error}")
+            self._discard(journal, seed)
+            return
+        late = float(demonstration.info["jitter_95_ms"])
+        timing = "" if late <= 1e3 * LATE_S else ": this computer is too busy, close other programs"
+        operator.say(f"  {demonstration.seconds:.1f} s; 95% of the steps within {late:.1f} ms of their time{timing}")
+        key = operator.ask("Enter keeps it, d discards it", ENTER + DISCARD)
+        while key == ENTER:
+            try:
+                self.writer.add(demonstration)
+                journal.discard()
+                break
+            except DatasetError as error:
+                operator.say(f"  {error}")
+                key = operator.ask("Enter tries again, d discards it", ENTER + DISCARD)
+        if not key:
+            raise StoppedError(f"{operator.stop.reason}; the arms hold; the episode is kept")
+        if key == DISCARD:
+            self._discard(journal, seed)
+            return
+        operator.say(f"  kept: {self.writer.num_episodes} in {self.writer.path}")
+        findings = check_demonstrations(load_demonstrations(self.writer.path)).findings
+        for finding in findings:
+            operator.say(f"    {finding}")
+        if not findings:
+            operator.say(f"    checked against the other demonstrations of {station.config.name}: no problem found")
+
+    def _demonstration(self, episode: Episode, seed: int | None) -> Demonstration:
+        config = self.station.config
+        rate = config.rate_hz
+        paced = Episode(episode.start, episode.steps, episode.seconds * config.pace, episode.calibration)
+        return demonstration_of(paced, self.station.arms, rate, self.writer.task, config.name, seed)
+
+    def _discard(self, journal: Journal, seed: int | None) -> None:
+        journal.discard()
+        self.writer.discard(seed)
+        self.operator.say(f"  discarded; {self.writer.num_episodes} are kept")
+
+    def _take_up(self, journal: Journal) -> None:
+        """Offer the episode that a process left behind."""
+        episode = journal.read()
+        if episode is None:
+            return
+        self.operator.say(f"an interrupted episode of {len(episode.steps)} steps was found")
+        if episode.calibration != self.station.config.digest:
+            self.operator.say("  it is of another calibration and is discarded")
+            self._discard(journal, None)
+            return
+        self._store(episode, journal, None)
+
+    def _park(self) -> None:
+        if is_parked(self.station):
+            return
+        played = park(self.station, self.operator.stop, self.station.config.first_run_speed)
+        if played.stopped:
+            raise StoppedError(f"{played.stopped}; the arms hold their position")
+
+
+def keep_calibration(config: CellConfig, folder: Path) -> None:
+    """Copy the cell's file and its calibration files into the dataset, one folder a calibration."""
+    kept = folder / "meta" / f"cell-{config.digest}"
+    for arm in tomllib.loads(read_regular(config.path).decode())["arms"]:
+        files = [arm.get("gripper"), arm.get("leader", {}).get("calibration")]
+        for name in filter(None, files):
+            write_whole(kept / Path(name).name, read_regular(config.path.parent / name))
+    for file in (config.path, config.camera_calibration):
+        if file is not None:
+            write_whole(kept / file.name, read_regular(file))

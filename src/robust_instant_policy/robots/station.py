@@ -1,0 +1,208 @@
+"""The arms of a cell behind one gate, and the loop that moves them.
+
+        ┌──────────── every 1 / rate_hz ────────────┐
+states ─▶ Gate.judge ─▶ next command ─▶ Gate.admit ─▶ followers
+             │                              │
+             └───── StoppedError, RobotError ──┴──▶ all followers stop and hold
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+
+from robust_instant_policy.errors import RobotError, StoppedError, UnreachableError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.arm import Arm, Motion
+from robust_instant_policy.motion.gate import Gate
+from robust_instant_policy.motion.state import ArmState, Command
+from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.follower import Follower
+from robust_instant_policy.robots.followers import make_follower
+from robust_instant_policy.robots.models import arm_of
+from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.robots.signals import StopRequest
+
+BRAKING_STEPS = 12  # control steps in which a motion is brought to rest when somebody asks for it
+BLENDING_STEPS = 25  # in which the difference between measured joints and the first command is taken back
+START_RAD = 0.1  # largest such difference
+
+
+@dataclass(frozen=True)
+class Played:
+    """The measured path of a motion, and why it was ``stopped``, empty where it came to its end."""
+
+    path: MeasuredPath
+    stopped: str
+
+
+class Ticker:
+    """Absolute deadlines at a rate, on a clock that a change of the system's time does not touch."""
+
+    def __init__(self, rate_hz: float):
+        self._period = 1 / rate_hz
+        self._next = time.monotonic()
+
+    def wait(self) -> float:
+        """Sleep until the next deadline and return the time, seconds. A missed deadline is not caught up with."""
+        self._next += self._period
+        now = time.monotonic()
+        if self._next > now:
+            time.sleep(self._next - now)
+            return time.monotonic()
+        self._next = now
+        return now
+
+
+class Station:
+    """The arms of a cell; a context manager that connects them, and at its end stops and disconnects them."""
+
+    def __init__(self, config: CellConfig):
+        self.config, self.rate_hz = config, config.rate_hz
+        self.arms = tuple(arm_of(arm, config.path.parent) for arm in config.arms)
+        self.followers: tuple[Follower, ...] = tuple(
+            make_follower(arm, one.driver, config.rate_hz) for arm, one in zip(self.arms, config.arms, strict=True)
+        )
+        self.gate = Gate(self.arms, config.limits, config.rate_hz)
+
+    def __enter__(self) -> Station:
+        with contextlib.ExitStack() as stack:
+            for follower in self.followers:
+                follower.connect()
+                stack.callback(follower.disconnect)
+            self._connected = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.stop()
+        self._connected.close()
+
+    def states(self) -> list[ArmState]:
+        """What the arms measure now."""
+        return [follower.state() for follower in self.followers]
+
+    def stop(self) -> None:
+        """All arms come to rest and hold."""
+        for follower in self.followers:
+            follower.stop()
+
+    def play(self, motion: Motion, stop: StopRequest) -> Played:
+        """Execute a motion that `motion.guard` has checked, from where the arms are now.
+
+        A request to ``stop`` brakes the motion on its path; anything that is wrong stops the arms at once.
+        """
+        log = _Log(len(motion.joints) + BRAKING_STEPS, motion.joints.shape[1:])
+        last = len(motion.joints) - 1
+        position, stride, step, offset = -1.0, 1.0, 0, np.zeros(motion.joints.shape[1:])
+
+        def command(states: Sequence[ArmState]) -> list[Command] | None:
+            nonlocal position, stride, step, offset
+            if step == 0:
+                offset = self._start_offset(motion, states)
+            if stop.reason:
+                stride -= 1 / BRAKING_STEPS
+            if position >= last or stride <= 0:
+                return None
+            position, step = min(position + stride, float(last)), step + 1
+            share = max(1 - step / BLENDING_STEPS, 0.0)
+            return _between(motion, position, share**3 * (10 - 15 * share + 6 * share**2) * offset)
+
+        stopped = ""
+        try:
+            self._loop(command, self.gate.admit, log)
+            if stop.reason:
+                stopped = f"stopped ({stop.reason})"
+        except (RobotError, UnreachableError) as error:
+            stopped = str(error)
+        return Played(log.path(self.rate_hz, self.arms), stopped)
+
+    def lead(self, command: Callable[[Sequence[ArmState]], Sequence[Command] | None]) -> None:
+        """Let the arms follow ``command(states)``, slowed down by `Gate.limited`, until it returns None."""
+        self._loop(command, self.gate.limited, None)
+
+    def _start_offset(self, motion: Motion, states: Sequence[ArmState]) -> FloatArray:
+        """Measured joints ``(A, J)`` minus the first ones of ``motion``; raises `StoppedError` where they are far."""
+        offset = np.stack([state.joints for state in states]) - motion.joints[0]
+        worst = np.abs(offset).max(axis=1)
+        arm = int(np.argmax(worst))
+        if worst[arm] > START_RAD:
+            raise StoppedError(
+                f"{self.arms[arm].name} is {worst[arm]:.2f} rad away from where the motion begins, at most {START_RAD} "
+                "are accepted; park it again"
+            )
+        return offset
+
+    def _loop(
+        self,
+        command: Callable[[Sequence[ArmState]], Sequence[Command] | None],
+        checked: Callable[[Sequence[Command]], Sequence[Command]],
+        log: _Log | None,
+    ) -> None:
+        states = self.states()
+        self.gate.start(states)
+        collecting = gc.isenabled()
+        gc.disable()  # a collection may take longer than a control step
+        try:
+            ticker = Ticker(self.rate_hz * self.config.pace)
+            while (wanted := command(states)) is not None:
+                now = ticker.wait()
+                sent = checked(wanted)
+                for follower, one in zip(self.followers, sent, strict=True):
+                    follower.command(one)
+                states = self.states()
+                if log is not None:
+                    log.add(now, sent, states)
+                self.gate.judge(states)
+        finally:
+            self.stop()  # also after the last command: the servos' watchdog would not let them go on later
+            if collecting:
+                gc.enable()
+
+
+class _Log:
+    """Rows of a `MeasuredPath`, in memory that is reserved before the motion."""
+
+    def __init__(self, rows: int, shape: tuple[int, ...]):
+        arms, joints = shape
+        self._commanded = np.empty((rows, arms, joints + 1))
+        self._measured = np.empty_like(self._commanded)
+        self._loads, self._seconds, self._count = np.empty((rows, arms)), np.empty(rows), 0
+
+    def add(self, now: float, commands: Sequence[Command], states: Sequence[ArmState]) -> None:
+        row = self._count
+        for arm, (told, state) in enumerate(zip(commands, states, strict=True)):
+            self._commanded[row, arm, :-1], self._commanded[row, arm, -1] = told.joints, told.finger_travel
+            self._measured[row, arm, :-1], self._measured[row, arm, -1] = state.joints, state.finger_travel
+            self._loads[row, arm] = state.grip_load
+        self._seconds[row] = now
+        self._count += 1
+
+    def path(self, rate_hz: float, arms: Sequence[Arm]) -> MeasuredPath:
+        n = self._count
+        commanded, measured = self._commanded[:n], self._measured[:n]
+        seconds = self._seconds[:n] - self._seconds[0] if n else np.zeros(0)
+
+        def tools(rows: FloatArray) -> FloatArray:
+            points = [[arm.kinematics.tool_pose(row[i, :-1])[:3, 3] for i, arm in enumerate(arms)] for row in rows]
+            return np.array(points).reshape(n, len(arms), 3)
+
+        return MeasuredPath(
+            rate_hz, commanded, measured, tools(commanded), tools(np.nan_to_num(measured)), self._loads[:n], seconds
+        )
+
+
+def _between(motion: Motion, position: float, offset: FloatArray) -> list[Command]:
+    """The commands at a fractional index of ``motion``, with an ``offset (A, J)`` of the joints."""
+    row, share = int(position), position - int(position)
+    after = min(row + 1, len(motion.joints) - 1)
+    joints: FloatArray = motion.joints[row] + share * (motion.joints[after] - motion.joints[row]) + offset
+    fingers = motion.fingers[row] + share * (motion.fingers[after] - motion.fingers[row])
+    return [Command(one, float(travel)) for one, travel in zip(joints, fingers, strict=True)]

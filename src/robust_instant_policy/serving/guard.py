@@ -1,0 +1,87 @@
+"""Who may use the server, and how much one request may hold."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+from collections.abc import Awaitable, Callable, MutableMapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from fastapi import HTTPException
+from starlette.responses import JSONResponse
+from starlette.websockets import WebSocket
+
+from robust_instant_policy.serving.address import is_loopback
+
+SCHEME = "Api-Key "  # of the header Authorization, as openpi's client sends it
+OPEN_PATHS = ("/healthz", "/docs", "/openapi.json")  # they need no key
+MAX_MESSAGE_BYTES = 64 * 2**20  # an RGB-D image of 3840 x 2160 pixels has 58 MB
+UPLOAD_S = 30.0  # for one HTTP request
+MAX_CONNECTIONS = 64  # by websocket
+
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+
+
+class Guard:
+    """ASGI middleware: every request needs the ``key``, if there is one, and none may come from a strange web page.
+
+    A browser lets any page open a websocket to this machine, so what has an Origin must have the server's own, and on
+    a loopback address the Host must be one, too.
+    """
+
+    def __init__(self, app: Any, host: str, key: str | None):
+        self.app, self.host, self.key = app, host, key
+
+    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            return await self.app(scope, receive, send)
+        refusal = self._refusal(scope)
+        if refusal is None:
+            own = limited(receive) if scope["type"] == "http" else receive
+            return await self.app(scope, own, send)
+        status, error = refusal
+        response = JSONResponse({"error": error}, status)
+        if scope["type"] == "websocket":
+            return await WebSocket(scope, receive, send).send_denial_response(response)
+        await response(scope, receive, send)
+
+    def _refusal(self, scope: Message) -> tuple[int, str] | None:
+        headers = {name.lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        host, origin = headers.get(b"host", ""), headers.get(b"origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return 403, f"a page of {origin[:100]} may not use this server"
+        if is_loopback(self.host) and not is_loopback(urlsplit(f"//{host}").hostname or ""):
+            return 403, f"this server is at {self.host}, not at {host[:100]!r}"
+        given = headers.get(b"authorization", "")
+        if self.key is None or scope["path"] in OPEN_PATHS:
+            return None
+        if not hmac.compare_digest(given.encode(), (SCHEME + self.key).encode()):
+            return 401, f"the header Authorization must be: {SCHEME}KEY"
+        return None
+
+
+def limited(receive: Receive) -> Receive:
+    """``receive`` of one HTTP request, with bounds for the size of the body and for the time that it takes."""
+    size, loop = 0, asyncio.get_running_loop()
+    end = loop.time() + UPLOAD_S
+    is_whole = False
+
+    async def bounded() -> Message:
+        nonlocal size, is_whole
+        if is_whole:  # what comes now is that the client has hung up
+            return await receive()
+        try:
+            async with asyncio.timeout_at(end):
+                message = await receive()
+        except TimeoutError:
+            raise HTTPException(408, f"the body took longer than {UPLOAD_S:.0f} s") from None
+        size += len(message.get("body", b""))
+        if size > MAX_MESSAGE_BYTES:
+            raise HTTPException(413, f"the body is larger than {MAX_MESSAGE_BYTES >> 20} MiB")
+        is_whole = not message.get("more_body", False)
+        return message
+
+    return bounded

@@ -1,0 +1,157 @@
+"""Calibration as a person does it: led through touches and photographs, and the commands."""
+
+import itertools
+import os
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+pytest.importorskip("dynamixel_sdk")
+
+from robust_instant_policy.cli import main
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.geometry import GripperTriangle, invert_pose, make_pose, transform_points
+from robust_instant_policy.robots.calibration import Board, CameraCalibration, on_table, touched_place
+from robust_instant_policy.robots.calibration.guided import Guide, photograph_places
+from robust_instant_policy.robots.camera import Frame
+from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.leaders import make_leader
+from robust_instant_policy.robots.models import arm_of
+from robust_instant_policy.robots.operator import ENTER
+from robust_instant_policy.robots.station import Station
+from tests.charuco import INTRINSICS, error_of, photograph
+from tests.robot_cell import CELL, PARK, Cell, Scripted
+
+BOARD = Board()
+CAMERA = make_pose(Rotation.from_euler("xyz", [180, 2, -90], degrees=True).as_matrix(), [-0.05, 0.0, 0.85])
+PLACES = [
+    make_pose(Rotation.from_euler("z", yaw, degrees=True).as_matrix(), [x, y, 0.0])
+    for x, y, yaw in [(-0.15, -0.1, 0), (-0.25, -0.3, 10), (-0.2, 0.1, -20), (0.1, 0.15, 60), (0.15, -0.1, 80)]
+]
+
+
+class TopCamera:
+    """Sees the board at one place after another."""
+
+    name = "top"
+
+    def __init__(self):
+        self.rng, self.places = np.random.default_rng(0), iter(PLACES)
+
+    def read(self):
+        rgb, depth = photograph(BOARD, invert_pose(CAMERA) @ next(self.places), self.rng)
+        return Frame(rgb, depth, INTRINSICS, 0.0)
+
+
+class Toucher(Scripted):
+    """Leads the arm to each corner that it is told to touch, and presses Enter when the arm has come there."""
+
+    def __init__(self, cell, arm):
+        super().__init__([("Enter", ENTER)], self.arrived)
+        self.cell, self.arm, self.corner = cell, arm, None
+
+    def say(self, line):
+        super().say(line)
+        if line.startswith("touch corner"):
+            self.corner = transform_points(PLACES[0], BOARD.outer_corners)["ABCD".index(line.split("corner ")[1][0])]
+        elif "coupled" in line:
+            self.cell.hand.script = [(joints, 0.0) for joints in self.way(self.corner)]
+            self.corner = None
+
+    def way(self, corner):
+        """Joints along a way up, across, and down to a corner, tool downward."""
+        start = self.arm.kinematics.tool_pose(self.cell.hand.joints)
+        down = Rotation.from_euler("x", np.pi)
+        knots = [start, *(make_pose(down.as_matrix(), corner + np.array([0, 0, height])) for height in (0.08, 0.0))]
+        if start[2, 3] < 0.05:
+            knots.insert(1, make_pose(start[:3, :3], start[:3, 3] + np.array([0, 0, 0.08])))
+        poses = []
+        for one, other in itertools.pairwise(knots):
+            turns = Slerp([0, 1], Rotation.from_matrix([one[:3, :3], other[:3, :3]]))
+            for share in np.linspace(0.02, 1, 50):
+                poses.append(make_pose(turns(share).as_matrix(), (1 - share) * one[:3, 3] + share * other[:3, 3]))
+        return self.arm.kinematics.follow(poses, self.cell.hand.joints).joints
+
+    def arrived(self):
+        if self.corner is not None or self.cell.hand.script:
+            return ""
+        gap = np.abs(self.cell.twin.state(0).joints - self.cell.hand.joints).max()
+        return ENTER if gap < 2e-3 else ""
+
+
+def test_a_person_who_touches_the_board_and_moves_it_over_the_table_calibrates_the_camera(tmp_path):
+    cell = Cell(tmp_path)
+    try:
+        with Station(cell.config) as station:
+            operator = Toucher(cell, station.arms[0])
+            leader = make_leader(cell.config.arms[0], station.arms[0], 50.0, tmp_path, operator.pressed)
+            leader.connect()
+            words = [f"touch corner {corner}" for corner in "ABCD"]
+            touched = Guide(station, leader, 0, operator).poses(words)[:, :3, 3]
+        np.testing.assert_allclose(touched, transform_points(PLACES[0], BOARD.outer_corners), atol=0.003)
+        camera = TopCamera()
+        frames = photograph_places(camera, BOARD, len(PLACES), operator)
+        _, angle = error_of(on_table("top", frames, BOARD, touched_place(touched, BOARD)).pose, CAMERA)
+        assert angle < 0.3
+    finally:
+        cell.unplug()
+
+
+def answer(monkeypatch, text):
+    """Give ``text`` as the lines that are typed."""
+    read, write = os.pipe()
+    os.write(write, text.encode())
+    os.close(write)
+    monkeypatch.setattr("sys.stdin", os.fdopen(read))
+
+
+def test_the_command_calibrates_from_a_board_at_a_stated_place(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    camera = TopCamera()
+    for index in range(len(PLACES)):
+        frame = camera.read()
+        Observation(frame.rgb, frame.depth, frame.intrinsics, np.eye(4)).save(folder / f"{index}.npz")
+    robot = tmp_path / "cell.toml"
+    text = CELL.format(park=PARK.tolist(), follower="/dev/null", leader="/dev/null", pace=1)
+    robot.write_text(text[: text.index("[emulation]")])
+    answer(monkeypatch, "\n" * len(PLACES))
+    command = ["calibrate", "camera", "--robot", str(robot), "--places", str(len(PLACES))]
+    assert main([*command, "--place", "-0.15", "-0.1", "0", "0"]) == 0
+    _, angle = error_of(CellConfig.load(robot).camera_pose, CAMERA)
+    assert angle < 0.1
+    assert CameraCalibration.load(tmp_path / "camera.toml").board == BOARD
+    assert "left out one by one: median 0." in capsys.readouterr().out
+    answer(monkeypatch, "\n")
+    assert main([*command, "--place", "-0.15", "-0.1", "0", "0"]) == 1
+    assert "the terminal was closed" in capsys.readouterr().err
+
+
+def test_a_measured_tool_moves_the_arms_model(tmp_path):
+    cell = Cell(tmp_path)
+    try:
+        config = cell.config.arms[0]
+        correction = make_pose(np.eye(3), [0.0, 0.004, 0.01])
+        (tmp_path / "gripper.toml").write_text(f"length = 0.1637\nopening = 0.07\ntool = {correction.tolist()}\n")
+        cell.file.write_text(cell.file.read_text().replace("driver =", 'gripper = "gripper.toml"\ndriver ='))
+        measured = arm_of(CellConfig.load(cell.file).arms[0], tmp_path)
+        assert measured.triangle == GripperTriangle(0.1637, 0.07)
+        expected = arm_of(config, tmp_path).kinematics.tool_pose(PARK) @ correction
+        np.testing.assert_allclose(measured.kinematics.tool_pose(PARK), expected, atol=1e-9)
+    finally:
+        cell.unplug()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["board", "--out", "board.gif"], "must end in .pdf or .png"),
+        (["board", "--square", "35", "--out", "b.png"], "both are edge lengths in metres"),
+        (["camera", "--robot", "nowhere.toml"], "no file at nowhere.toml"),
+    ],
+)
+def test_wrong_usage_is_one_line(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["calibrate", *arguments]) != 0
+    assert words in capsys.readouterr().err
