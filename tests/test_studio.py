@@ -19,7 +19,7 @@ from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import Proposal, Settings, build_context, locate
-from robust_instant_policy.sanity import check_demonstrations
+from robust_instant_policy.sanity import check_demonstrations, errors
 from tests.conftest import NUM_DEMONSTRATIONS
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed; run: make setup")
@@ -189,7 +189,7 @@ def test_a_demonstration_by_keys_is_kept_like_any_other(studio):
     studio.banner("Your turn")
     *earlier, kept = load_demonstrations(studio.folder, task="push-cube")
     assert len(earlier) == NUM_DEMONSTRATIONS
-    assert not check_demonstrations([*earlier, kept]).findings
+    assert not errors(check_demonstrations([*earlier, kept]).findings)
     assert kept.rate_hz == 55
     assert kept.seed == studio.session.seed - 1
     np.testing.assert_array_equal(kept.observation.rgb, start.rgb)
@@ -206,7 +206,7 @@ def test_a_second_browser_looks_on_until_it_takes_the_controls(studio):
     other.get_by_text("Another scene").click()
     other.get_by_text("Another browser holds the controls").wait_for(timeout=1000 * PATIENCE_S)
     seed = studio.session.seed
-    other.get_by_text("Take the controls").click()
+    other.get_by_role("button", name="Take the controls").click()
     other.get_by_text("Another scene").click()
     wait_until(lambda: studio.session.seed == seed + 1, "the scene changes")
     other.close()
@@ -239,17 +239,18 @@ def test_the_t_regression_ignores_a_candidate_that_is_dragged_away_and_the_gauss
     scene = locate(context, Observation.load(workbench / "observation.npz"))
     candidates = context.prompt.for_scene(scene.keypoints).carried_over(scene.keypoints, 5)
     draft = Draft(context, scene, settings, Proposal(candidates), "")
-    away = Choices(dragged={0: (0.5, np.array([0.0, 0.0, 0.15]))})
+    far, farther = (Choices(dragged={0: (0.5, np.array([0.0, 0.0, way]))}) for way in (0.15, 0.30))
 
     def moved(dof: float) -> float:
-        before, after = (tool_path(draft.plan(choices, dof).trajectory, 0) for choices in (Choices(), away))
-        return float(np.linalg.norm(after - before, axis=1).max())
+        """How far the trajectory follows from ``far`` to ``farther``, metres."""
+        one, other = (tool_path(draft.plan(choices, dof).trajectory, 0) for choices in (far, farther))
+        return float(np.linalg.norm(other - one, axis=1).max())
 
-    assert moved(1.5) < 0.005
+    assert moved(1.5) < 0.002
     assert moved(np.inf) > 0.02
-    assert draft.plan(away).hallucinated.tolist() == [True, False, False, False, False]
+    assert draft.plan(far).hallucinated.tolist() == [True, False, False, False, False]
     quiet, noisy = (spread(draft.plan(Choices(noise=noise)), 0).mean() for noise in (0.0, 0.02))
-    assert noisy > 3 * quiet
+    assert noisy > 1.5 * quiet
 
 
 def test_a_recorded_folder_is_shown_without_a_simulator(workbench):

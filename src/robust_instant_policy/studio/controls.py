@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -19,6 +20,7 @@ class Controls:
         self._server = server
         self._holder: int | None = None
         self._buttons: dict[int, viser.GuiButtonHandle] = {}
+        self._told: dict[int, float] = {}  # when an onlooker was told that it is one
         server.on_client_connect(self._come)
         server.on_client_disconnect(self._leave)
 
@@ -28,7 +30,8 @@ class Controls:
         async def callback(event: Any) -> None:
             if event.client_id is None or event.client_id == self._holder:
                 action(event)
-            elif event.client is not None:
+            elif event.client is not None and time.monotonic() - self._told.get(event.client_id, 0.0) > NOTE_S:
+                self._told[event.client_id] = time.monotonic()
                 event.client.add_notification(
                     "You are looking on",
                     "Another browser holds the controls. Press “Take the controls” to have them.",
@@ -68,6 +71,7 @@ class Controls:
 
     async def _leave(self, client: viser.ClientHandle) -> None:
         self._buttons.pop(client.client_id, None)
+        self._told.pop(client.client_id, None)
         if client.client_id == self._holder:
             others = self._server.get_clients()
             self._give(next(iter(others), None))

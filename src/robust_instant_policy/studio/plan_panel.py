@@ -81,6 +81,7 @@ class PlanPanel:
             if before is not None and np.array_equal(before.rgb, observation.rgb):
                 return  # the same scene again
             self._observation = observation
+            self.planner.cancel("")
             self._forget()
             self._picture.content = drawing.keypoint_picture(observation.rgb)
             self._outcome.content = ""

@@ -33,6 +33,7 @@ from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 COMPARED = ("rip", "rip-gauss", "mean", "kat", "neighbours")
 DRAG_REACH = 0.12  # share of the trajectory's time over which a candidate that is dragged away gives way
+CLOSE_TIMEOUT_S = 5.0  # for the stage of a cancelled plan to end; a model that is busy longer is left to the system
 PAPER_ESTIMATOR = "em-number"  # the model of the paper's networks, fitted exactly in milliseconds
 
 
@@ -131,10 +132,10 @@ class Planner:
         work = self._job, tuple(demonstrations), observation, settings, queries
         threading.Thread(target=self._work, args=work, name="planner", daemon=True).start()
 
-    def cancel(self) -> None:
-        """End planning; a stage that is under way ends unheard."""
+    def cancel(self, reason: str = "cancelled") -> None:
+        """End planning for ``reason``; a stage that is under way ends unheard."""
         self._job += 1
-        self._on_end("cancelled")
+        self._on_end(reason)
 
     def _work(
         self,
@@ -200,5 +201,5 @@ class Planner:
 
     def close(self) -> None:
         self._job += 1
-        if self._model is not None:
+        if self._lock.acquire(timeout=CLOSE_TIMEOUT_S) and self._model is not None:
             self._model.close()

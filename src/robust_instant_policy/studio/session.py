@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -243,6 +244,9 @@ class Session:
                     job()
                 except RipError as error:
                     self._watcher.on_message(str(error))
+                except Exception as error:  # a fault of one action must not end the session
+                    traceback.print_exc()
+                    self._watcher.on_message(f"unexpected {type(error).__name__}: {error}; see the terminal")
                 job = self._jobs.get_nowait()
         except queue.Empty:
             pass

@@ -24,13 +24,13 @@ class SimulatedCell:
     """The cell of a simulated task; see `cell.Cell`."""
 
     def __init__(self, name: str):
-        task = make_task(name)
+        task: object = make_task(name)
         if not isinstance(task, SimulatedTask):
             raise UsageError(f"{name} has no cell that can be operated by hand")
         self._task, self._cell = task, task.cell
         self.task, self.description, self.goal = task.name, task.description, task.goal
         self.arms, self.triangle = task.arms, task.arms[0].triangle
-        self.control_hz, self.record_every = task.timing.control_hz, task.timing.record_every
+        self.control_hz, self.record_every = task.control_hz, round(task.control_hz / task.record_hz)
         self.execute_hz = task.execute_hz
         self.workspace: FloatArray | None = task.workspace
         self._bodies: _Bodies = _SapienBodies(task.cell) if hasattr(task.cell, "agent") else _MujocoBodies(task.cell)

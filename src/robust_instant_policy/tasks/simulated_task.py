@@ -120,10 +120,6 @@ class SimulatedTask:
         self._seed: int | None = None
         self._fresh = False  # no motion since the scene was built
 
-    @property
-    def timing(self) -> Timing:
-        return self._timing
-
     def reset(self, seed: int) -> Observation:
         self._rebuild(seed)
         return self.look()
