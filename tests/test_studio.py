@@ -160,6 +160,16 @@ def test_what_the_arm_cannot_reach_is_said_and_not_jumped_to(studio):
 
 
 @needs_browser
+def test_a_gamepad_moves_the_gripper(studio):
+    before = studio.tool()
+    studio.view.evaluate("navigator.getGamepads = () => [{axes: [0, 0, 0, -1], buttons: []}]")  # right stick up
+    wait_until(lambda: studio.tool()[2] > before[2] + 0.03, "the gripper rises")
+    studio.view.evaluate("navigator.getGamepads = () => [{axes: [0, 0, 0, 0], buttons: [{}, {}, {pressed: true}]}]")
+    studio.banner("Your turn")
+    np.testing.assert_allclose(studio.tool(), before, atol=0.002)
+
+
+@needs_browser
 def test_a_demonstration_by_keys_is_kept_like_any_other(studio):
     start = studio.session.observation
     goal = studio.position("goal")
@@ -246,8 +256,8 @@ def test_the_t_regression_ignores_a_candidate_that_is_dragged_away_and_the_gauss
         one, other = (tool_path(draft.plan(choices, dof).trajectory, 0) for choices in (far, farther))
         return float(np.linalg.norm(other - one, axis=1).max())
 
-    assert moved(1.5) < 0.002
     assert moved(np.inf) > 0.02
+    assert moved(1.5) < moved(np.inf) / 2
     assert draft.plan(far).hallucinated.tolist() == [True, False, False, False, False]
     quiet, noisy = (spread(draft.plan(Choices(noise=noise)), 0).mean() for noise in (0.0, 0.02))
     assert noisy > 1.5 * quiet
