@@ -98,7 +98,9 @@ def test_demonstrations_are_on_a_timeline(workbench, tmp_path, capsys):
     assert len(read.rows("/world/plan/gripper", "strips")) == sum(len(demo.trajectory) for demo in demos)
 
 
-def test_a_file_of_another_kind_is_refused(workbench, tmp_path, capsys):
-    file = str(tmp_path / "demos.html")
-    assert main(["view", "--demos", str(workbench / "data" / "push-cube"), "--rerun", file]) == 2
-    assert ".rrd" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("where", "status", "said"), [("demos.html", 2, ".rrd"), ("rerun+http://127.0.0.1:1/proxy", 1, "no viewer answers")]
+)
+def test_a_file_of_another_kind_and_a_viewer_that_is_not_there_are_said(workbench, capsys, where, status, said):
+    assert main(["view", "--demos", str(workbench / "data" / "push-cube"), "--rerun", where]) == status
+    assert said in capsys.readouterr().err

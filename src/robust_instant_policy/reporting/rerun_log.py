@@ -7,10 +7,12 @@ Needs the extra `rerun`.
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     import rerun as rr
 
 LIVE = "live"  # in place of a file: a viewer, which is started where none runs
+DEFAULT_PORT = 9876  # of Rerun's viewer
+CONNECT_S = 5.0  # for a viewer to answer
 FLUSH_S = 120.0  # for a viewer to take what was logged
 MAX_POINTS = 40_000  # of a point cloud
 POINT_M, KEYPOINT_M, PATH_M, CANDIDATE_M = 0.0015, 0.008, 0.004, 0.002  # radii
@@ -49,6 +53,7 @@ def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
     if where == LIVE:
         recording.spawn(default_blueprint=_blueprint())
     elif where.startswith(("rerun://", "rerun+http://", "rerun+https://")):
+        _require_viewer(where)
         recording.connect_grpc(where, default_blueprint=_blueprint())
     elif where.endswith(".rrd"):
         require_replaceable(Path(where))
@@ -65,6 +70,15 @@ def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
         raise RipError(f"what was logged did not arrive at {where}: {excerpt(error)}; is a viewer there?") from None
     finally:
         recording.disconnect()
+
+
+def _require_viewer(address: str) -> None:
+    """Raises `RipError` where nothing listens at ``address``: the recording would wait for it."""
+    try:
+        place = urlsplit(address)
+        socket.create_connection((place.hostname or "", place.port or DEFAULT_PORT), CONNECT_S).close()
+    except (OSError, ValueError) as error:
+        raise RipError(f"no viewer answers at {address} ({error}); start one with: rerun --serve-grpc") from None
 
 
 def log_plan(
