@@ -73,6 +73,7 @@ def main() -> None:
                 (f"key to motion in the picture, {len(delays)} presses: median (quartile, 90%)",
                  f"{median:.0f} ms ({quarter:.0f}, {most:.0f})")
             )  # fmt: skip
+            write(rows)
             process = psutil.Process(server.pid)
             before = process.memory_info().rss
             scenes = use(page, 60 * options.minutes)
@@ -83,6 +84,7 @@ def main() -> None:
                     f"{grown:+.0f} MB of {before / 1e6:.0f}",
                 )
             )
+            write(rows)
             seconds = tasks_in_turn(page)
             rows.append(
                 (
@@ -91,14 +93,18 @@ def main() -> None:
                 )
             )
             rows.append(("memory after that", f"{process.memory_info().rss / 1e6:.0f} MB"))
+            write(rows)
             browser.close()
         finally:
             server.send_signal(signal.SIGTERM)
             server.wait(30)
-    load = os.getloadavg()[0]
-    lines = [f"| quantity ({os.cpu_count()} cores, load {load:.1f} at the end) | measured |", "| --- | --- |"]
-    TABLE.write_text("\n".join([*lines, *(f"| {name} | {value} |" for name, value in rows)]) + "\n")
-    print(TABLE.read_text())
+
+
+def write(rows: list[tuple[str, str]]) -> None:
+    """Write the table of what was measured so far."""
+    head = f"| quantity ({os.cpu_count()} cores, load average {os.getloadavg()[1]:.1f} with other work) | measured |"
+    TABLE.write_text("\n".join([head, "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows)]) + "\n")
+    print(TABLE.read_text(), flush=True)
 
 
 def wait(page: Page, text: str) -> None:
@@ -158,11 +164,17 @@ def tasks_in_turn(page: Page) -> list[float]:
     """Seconds to open each of ten tasks."""
     seconds = []
     for name in (*TASK_NAMES[1:TASKS_IN_TURN], TASK_NAMES[0]):
-        start = time.monotonic()
-        page.get_by_role("textbox", name="Task").click()
+        start, before = time.monotonic(), page.inner_text("#studio-banner")
+        page.locator("input.mantine-Select-input").first.click()
         page.get_by_role("option", name=name, exact=True).click()
-        wait(page, "Opening")
-        wait(page, "Your turn")
+        page.wait_for_function(
+            """before => {
+                const text = document.querySelector("#studio-banner")?.innerText ?? "";
+                return text.startsWith("Your turn") && text !== before;
+            }""",
+            arg=before,
+            timeout=PATIENCE_MS,
+        )
         seconds.append(time.monotonic() - start)
     return seconds
 
