@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ from robust_instant_policy.tasks import TASK_NAMES
 ROOT = Path(__file__).parents[1]
 TABLE = ROOT / "docs" / "tables" / "studio.md"
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-PRESSES = 40
+PRESSES = 30
+REST_MS = 2000  # between presses, for the arm to come to rest in the picture
 CHANGED, CHANGED_PIXELS = 40, 30  # difference of a colour, and number of pixels, from which the arm has moved
 PATIENCE_MS = 300_000
 TASKS_IN_TURN = 10
@@ -127,20 +129,21 @@ def latencies(page: Page) -> list[float]:
     client.on("Page.screencastFrame", take)
     client.send("Page.startScreencast", {"format": "jpeg", "quality": 60, "everyNthFrame": 1})
     page.keyboard.press("u")  # a recording begins
-    delays = []
+    sent = []
     for press in range(PRESSES):
-        page.wait_for_timeout(900)  # until the arm is at rest
-        still = frames[-1][1]
-        frames.clear()
-        sent = time.time()
+        page.wait_for_timeout(REST_MS)
+        sent.append(time.time())
         for _ in range(6):
             page.keyboard.press("ulojikoi"[press % 8])
-        for _ in range(20):
-            page.wait_for_timeout(50)
-            moved = [at for at, picture in frames if (abs(picture - still) > CHANGED).sum() > CHANGED_PIXELS]
-            if moved:
-                delays.append(1000 * (moved[0] - sent))
-                break
+    page.wait_for_timeout(2 * REST_MS)  # pictures come late where the machine is busy
+    delays = []
+    for start, end in pairwise([*sent, time.time()]):
+        still = [picture for at, picture in frames if at <= start][-1]
+        moved = [
+            at for at, picture in frames if start < at < end and (abs(picture - still) > CHANGED).sum() > CHANGED_PIXELS
+        ]
+        if moved:
+            delays.append(1000 * (moved[0] - start))
     client.send("Page.stopScreencast")
     return delays
 
