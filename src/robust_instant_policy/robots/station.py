@@ -20,7 +20,7 @@ import numpy as np
 from robust_instant_policy.errors import RobotError, StoppedError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
-from robust_instant_policy.motion.gate import Gate
+from robust_instant_policy.motion.gate import STALE_S, Gate
 from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.follower import Follower
@@ -32,6 +32,7 @@ from robust_instant_policy.robots.signals import StopRequest
 BRAKING_STEPS = 12  # control steps in which a motion is brought to rest when somebody asks for it
 BLENDING_STEPS = 25  # in which the difference between measured joints and the first command is taken back
 START_RAD = 0.1  # largest such difference
+EMULATED_STALE_S = 0.5  # an emulation shares the processor with what uses it
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,8 @@ class Station:
         self.followers: tuple[Follower, ...] = tuple(
             make_follower(arm, one.driver, config.rate_hz) for arm, one in zip(self.arms, config.arms, strict=True)
         )
-        self.gate = Gate(self.arms, config.limits, config.rate_hz)
+        stale_s = STALE_S if config.emulation is None else EMULATED_STALE_S
+        self.gate = Gate(self.arms, config.limits, config.rate_hz, stale_s)
 
     def __enter__(self) -> Station:
         with contextlib.ExitStack() as stack:

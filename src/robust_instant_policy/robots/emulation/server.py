@@ -20,6 +20,7 @@ import numpy as np
 
 from robust_instant_policy.errors import CellError, RipError
 from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.emulation.controller import Controller
 from robust_instant_policy.robots.emulation.faults import FaultSwitch
 from robust_instant_policy.robots.emulation.servos import ServoBus
 from robust_instant_policy.robots.emulation.twin import SharedTwin, Twin
@@ -40,6 +41,8 @@ class Device(Protocol):
 def make_device(kind: str, twin: SharedTwin, index: int, finger_travel: float) -> Device:
     if kind == "viperx":
         return ServoBus(twin, index, finger_travel)
+    if kind == "ur5e":
+        return Controller(twin, index, finger_travel)
     raise CellError(f"an arm with the driver {kind!r} cannot be emulated")
 
 
