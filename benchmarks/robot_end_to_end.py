@@ -12,6 +12,7 @@ executes the plans, too, in the same scenes. An interrupted run continues.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import multiprocessing
 import os
@@ -50,6 +51,7 @@ from robust_instant_policy.sanity import check_demonstrations
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.task import Attempt, Task
 
+REAL_TIME = 2  # priority of the emulated buses: real servos have processors of their own
 REST_S = 0.4  # of the hand, after it has shown a demonstration
 CELL = """
 [cell]
@@ -114,6 +116,13 @@ class Person:
         return ENTER
 
 
+def real_time(pid: int) -> None:
+    """Give all threads of a process a real-time priority where the system permits it."""
+    for thread in os.listdir(f"/proc/{pid}/task"):
+        with contextlib.suppress(PermissionError, ProcessLookupError):
+            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(REAL_TIME))
+
+
 def rows_of(attempt: Attempt, arm: Arm) -> np.ndarray:
     """Joints and finger travel ``(T, 7)`` at 50 Hz that show the demonstration of an attempt."""
     trajectory, rate = attempt.demonstration.trajectory, attempt.demonstration.rate_hz
@@ -137,6 +146,8 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
     leading.start()
     with emulated(config) as emulation:
         port = DeviceConfig("aloha", MappingProxyType(ours.recv()), "leader")
+        for pid in (leading.pid, emulation.pid):
+            real_time(pid or 0)
         config = replace(emulation.config, arms=(replace(emulation.config.arms[0], leader=port),))
         person = Person(ours)
         results: dict[int, str] = {}

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -32,6 +33,7 @@ from robust_instant_policy.robots.signals import StopRequest
 BRAKING_STEPS = 12  # control steps in which a motion is brought to rest when somebody asks for it
 BLENDING_STEPS = 25  # in which the difference between measured joints and the first command is taken back
 START_RAD = 0.1  # largest such difference
+REAL_TIME = 1  # the lowest real-time priority
 EMULATED_STALE_S = 0.5  # an emulation shares the processor with what uses it
 
 
@@ -150,23 +152,36 @@ class Station:
     ) -> None:
         states = self.states()
         self.gate.start(states)
-        collecting = gc.isenabled()
-        gc.disable()  # a collection may take longer than a control step
         try:
-            ticker = Ticker(self.rate_hz * self.config.pace)
-            while (wanted := command(states)) is not None:
-                now = ticker.wait()
-                sent = checked(wanted)
-                for follower, one in zip(self.followers, sent, strict=True):
-                    follower.command(one)
-                states = self.states()
-                if log is not None:
-                    log.add(now, sent, states)
-                self.gate.judge(states)
+            with _undisturbed():
+                ticker = Ticker(self.rate_hz * self.config.pace)
+                while (wanted := command(states)) is not None:
+                    now = ticker.wait()
+                    sent = checked(wanted)
+                    for follower, one in zip(self.followers, sent, strict=True):
+                        follower.command(one)
+                    states = self.states()
+                    if log is not None:
+                        log.add(now, sent, states)
+                    self.gate.judge(states)
         finally:
             self.stop()  # also after the last command: the servos' watchdog would not let them go on later
-            if collecting:
-                gc.enable()
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """No garbage collection, which may take longer than a control step, and a real-time priority for this thread where
+    the system permits one (root, or ``rtprio`` in limits.conf)."""
+    collecting, policy, usual = gc.isenabled(), os.sched_getscheduler(0), os.sched_getparam(0)
+    gc.disable()
+    try:
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME))
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, usual)
+        if collecting:
+            gc.enable()
 
 
 class _Log:
