@@ -143,13 +143,14 @@ class SimulatedTask:
         control_hz = self._timing.control_hz
         before_step = self._filming(on_frame)
         motion = Motion.at_home(self._arms)
+        rate_hz = controller.rate_hz or self.execute_hz
         steps, worst, failure = 0, 0.0, ""
         while steps < max_seconds * control_hz and not failure:
-            waypoints = controller.act(self.look().rgb, self._action(motion.closed[-1]))
+            waypoints = controller.act(self.look(), self._action(motion.closed[-1]))
             if waypoints is None:
                 break
             try:
-                motion = plan_onward(waypoints, controller.rate_hz, motion, self._arms, control_hz)
+                motion = plan_onward(waypoints, rate_hz, motion, self._arms, control_hz)
             except UnreachableError as error:
                 failure = f"refused after {steps / control_hz:.1f} s: {error}"
             else:
