@@ -19,6 +19,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -98,6 +99,7 @@ class Person:
 
     def __init__(self, wire: Connection):
         self.stop, self.wire = StopRequest(), wire
+        self.on_end: Callable[[], object] = lambda: None
         self.rows, self.done = np.zeros((0, 7)), np.inf
 
     def say(self, line: str) -> None:
@@ -113,6 +115,8 @@ class Person:
         return ENTER
 
     def ask(self, line: str, keys: str) -> str:
+        if "keeps it" in line:
+            self.on_end()
         return ENTER
 
 
@@ -150,7 +154,8 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
             real_time(pid or 0)
         config = replace(emulation.config, arms=(replace(emulation.config.arms[0], leader=port),))
         person = Person(ours)
-        results: dict[int, str] = {}
+        results: list[str] = []
+        person.on_end = lambda: results.append(emulation.failure())
         with (
             Station(config) as station,
             DatasetWriter(folder, task.name, task.description, config.rate_hz) as writer,
@@ -161,9 +166,6 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
             seeds = iter(range(0 if writer.last_seed is None else writer.last_seed + 1, 10_000))
 
             def next_scene() -> int:
-                if results:
-                    last = max(results)
-                    results[last] = emulation.failure()
                 for seed in seeds:  # a person repeats what failed; so does the task's demonstrator
                     attempt = task.demonstrate(seed)
                     if attempt.success:
@@ -171,13 +173,10 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
                 person.rows = rows_of(attempt, arm)
                 ours.send(person.rows[:1])
                 emulation.scene(seed)
-                results[seed] = ""
                 return seed
 
             camera = make_camera(config.camera, folder)
             Session(station, [leader], camera, writer, person, lambda seen: None, next_scene).record(count)
-            if results:
-                results[max(results)] = emulation.failure()
             leader.disconnect()
     ours.send(None)
     leading.join()
@@ -186,7 +185,7 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
     return {
         "demonstrations": len(demonstrations),
         "seconds": float(np.mean([one.seconds for one in demonstrations])),
-        "done": sum(not failure for failure in results.values()),
+        "done": sum(not failure for failure in results),
         "tried": len(results),
         "jitter_median_ms": float(np.median(late)),
         "jitter_worst_ms": max(late),

@@ -73,6 +73,7 @@ class Station:
             make_follower(arm, one.driver, config.rate_hz) for arm, one in zip(self.arms, config.arms, strict=True)
         )
         stale_s = STALE_S if config.emulation is None else EMULATED_STALE_S
+        self.sent_at = 0.0  # of the last command, seconds of a clock that does not jump
         self.gate = Gate(self.arms, config.limits, config.rate_hz, stale_s)
 
     def __enter__(self) -> Station:
@@ -156,7 +157,7 @@ class Station:
             with _undisturbed():
                 ticker = Ticker(self.rate_hz * self.config.pace)
                 while (wanted := command(states)) is not None:
-                    now = ticker.wait()
+                    now = self.sent_at = ticker.wait()
                     sent = checked(wanted)
                     for follower, one in zip(self.followers, sent, strict=True):
                         follower.command(one)
