@@ -12,7 +12,6 @@ executes the plans, too, in the same scenes. An interrupted run continues.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import multiprocessing
 import os
@@ -45,6 +44,7 @@ from robust_instant_policy.robots.emulation.twin import SharedTwin, TwinState
 from robust_instant_policy.robots.leaders import make_leader
 from robust_instant_policy.robots.operator import ENTER
 from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.robots.priority import DEVICE, take_real_time
 from robust_instant_policy.robots.session import Session
 from robust_instant_policy.robots.signals import StopRequest
 from robust_instant_policy.robots.station import Station
@@ -52,7 +52,6 @@ from robust_instant_policy.sanity import check_demonstrations
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.task import Attempt, Task
 
-REAL_TIME = 2  # priority of the emulated buses: real servos have processors of their own
 REST_S = 0.4  # of the hand, after it has shown a demonstration
 CELL = """
 [cell]
@@ -88,6 +87,7 @@ class Hand:
 
 def lead(rest: np.ndarray, travel: float, wire: Connection) -> None:
     """Emulate the leader's bus; begin the rows that come over ``wire``, until None comes."""
+    take_real_time(DEVICE)
     hand = Hand(rest)
     wire.send(ServoBus(SharedTwin(hand), 0, travel).options)
     while (rows := wire.recv()) is not None:
@@ -120,13 +120,6 @@ class Person:
         return ENTER
 
 
-def real_time(pid: int) -> None:
-    """Give all threads of a process a real-time priority where the system permits it."""
-    for thread in os.listdir(f"/proc/{pid}/task"):
-        with contextlib.suppress(PermissionError, ProcessLookupError):
-            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(REAL_TIME))
-
-
 def rows_of(attempt: Attempt, arm: Arm) -> np.ndarray:
     """Joints and finger travel ``(T, 7)`` at 50 Hz that show the demonstration of an attempt."""
     trajectory, rate = attempt.demonstration.trajectory, attempt.demonstration.rate_hz
@@ -150,8 +143,6 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
     leading.start()
     with emulated(config) as emulation:
         port = DeviceConfig("aloha", MappingProxyType(ours.recv()), "leader")
-        for pid in (leading.pid, emulation.pid):
-            real_time(pid or 0)
         config = replace(emulation.config, arms=(replace(emulation.config.arms[0], leader=port),))
         person = Person(ours)
         results: list[str] = []

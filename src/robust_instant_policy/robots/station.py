@@ -28,12 +28,12 @@ from robust_instant_policy.robots.follower import Follower
 from robust_instant_policy.robots.followers import make_follower
 from robust_instant_policy.robots.models import arm_of
 from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.robots.priority import CONTROL, take_real_time
 from robust_instant_policy.robots.signals import StopRequest
 
 BRAKING_STEPS = 12  # control steps in which a motion is brought to rest when somebody asks for it
 BLENDING_STEPS = 25  # in which the difference between measured joints and the first command is taken back
 START_RAD = 0.1  # largest such difference
-REAL_TIME = 1  # the lowest real-time priority
 EMULATED_STALE_S = 0.5  # an emulation shares the processor with what uses it
 
 
@@ -171,13 +171,11 @@ class Station:
 
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
-    """No garbage collection, which may take longer than a control step, and a real-time priority for this thread where
-    the system permits one (root, or ``rtprio`` in limits.conf)."""
+    """No garbage collection, which may take longer than a control step, and a real-time priority for this thread."""
     collecting, policy, usual = gc.isenabled(), os.sched_getscheduler(0), os.sched_getparam(0)
     gc.disable()
     try:
-        with contextlib.suppress(PermissionError):
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME))
+        take_real_time(CONTROL)
         yield
     finally:
         os.sched_setscheduler(0, policy, usual)
