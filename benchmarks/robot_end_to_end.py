@@ -257,8 +257,8 @@ def table(name: str, method: str, recorded: dict, rows: list[dict]) -> str:
         "| --- | --- |",
         f"| demonstrations at 50 Hz, mean length | {recorded['demonstrations']}, {recorded['seconds']:.1f} s |",
         f"| of them with the task done | {recorded['done']} of {recorded['tried']} |",
-        f"| jitter, 95% of the steps (median, worst demonstration) | {recorded['jitter_median_ms']:.1f} ms, "
-        f"{recorded['jitter_worst_ms']:.1f} ms |",
+        f"| jitter, 95% of the steps (median, worst demonstration) | {recorded['jitter_median_ms']:.2f} ms, "
+        f"{recorded['jitter_worst_ms']:.2f} ms |",
         f"| findings of `rip check` | {'; '.join(recorded['findings']) or 'none'} |",
     ]
     if rows:
@@ -266,9 +266,9 @@ def table(name: str, method: str, recorded: dict, rows: list[dict]) -> str:
             f"| `rip run`, plans by {method}: task done | {done} of {len(rows)} scenes ({low}% to {high}%) |",
             f"| the same plans executed by the simulated task | {same} of {len(rows)} |",
             f"| scenes in which the two differ | {sum(row['cell'] != row['simulator'] for row in rows)} |",
-            f"| jitter of `rip run`, 95% of the steps (median, worst run) | {np.median(jitter):.1f} ms, "
-            f"{max(jitter):.1f} ms |",
-            f"| largest following error | {max(following):.2f} rad |",
+            f"| jitter of `rip run`, 95% of the steps (median, worst run) | {np.median(jitter):.2f} ms, "
+            f"{max(jitter):.2f} ms |",
+            f"| largest following error | {max(following):.3f} rad |",
         ]
     load = recorded["load"]
     lines += ["", f"{os.cpu_count()} cores, no GPU; load of the machine at the end of the recording {load:.1f}."]

@@ -100,7 +100,7 @@ class Session:
             return
         late = float(demonstration.info["jitter_95_ms"])
         timing = "" if late <= 1e3 * LATE_S else ": this computer is too busy, close other programs"
-        operator.say(f"  {demonstration.seconds:.1f} s; 95% of the steps within {late:.1f} ms of their time{timing}")
+        operator.say(f"  {demonstration.seconds:.1f} s; 95% of the steps within {late:.2f} ms of their time{timing}")
         key = operator.ask("Enter keeps it, d discards it", ENTER + DISCARD)
         while key == ENTER:
             try:
