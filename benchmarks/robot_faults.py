@@ -76,8 +76,9 @@ class Bench:
         name, model, base, parked, self.middle, pace = CELLS[kind]
         path = folder / f"{kind}.toml"
         path.write_text(
-            f"[cell]\nworkspace = [[-0.4, -0.4, -0.005], [0.4, 0.4, 0.4]]\n[[arms]]\nname = '{name}'\nmodel = '{model}'\n"
-            f"base = {list(base)}\npark = {list(parked)}\ndriver = {{ kind = '{kind}' }}\n[emulation]\npace = {pace}\n"
+            f"[cell]\nworkspace = [[-0.4, -0.4, -0.005], [0.4, 0.4, 0.4]]\n"
+            f"[[arms]]\nname = '{name}'\nmodel = '{model}'\nbase = {list(base)}\npark = {list(parked)}\n"
+            f"driver = {{ kind = '{kind}' }}\n[emulation]\npace = {pace}\n"
         )
         self.name, self._config = name, CellConfig.load(path)
         self._context, self._emulation = None, None
@@ -148,7 +149,7 @@ def clock_jump(case: Case) -> Outcome:
     emulation = case.bench.ready()
     begun = len(emulation.commands())
     real, jump = time.time, [0.0]
-    with mock.patch("time.time", lambda: real() + jump[0]), Station(emulation.config) as station:
+    with mock.patch("time.time", side_effect=lambda: real() + jump[0]), Station(emulation.config) as station:
         motion = case.motion(station)
         with _at(
             emulation, begun + case.moment(motion), lambda: jump.__setitem__(0, case.rng.choice([-3600.0, 3600.0]))
@@ -163,7 +164,7 @@ def ended_by(number: signal.Signals) -> Callable[[Case], Outcome]:
     def inject(case: Case) -> Outcome:
         emulation = case.bench.ready()
         begun = len(emulation.commands())
-        process = multiprocessing.get_context("spawn").Process(target=_victim, args=(case, emulation))
+        process = multiprocessing.get_context("fork").Process(target=_victim, args=(case, emulation))
         process.start()
         with _at(emulation, begun + int(case.rng.integers(10, 100)), lambda: os.kill(process.pid, number)):
             process.join()
@@ -243,8 +244,7 @@ def wrong_plan(fault: str) -> Callable[[Case], Outcome]:
                 points += case.rng.choice([-1, 1], 3) * [0.4, 0.4, 0.0]
             elif fault == "turn":
                 middle = points.mean(axis=0)
-                points[:, :2] = middle[:2] - (points - middle)[:, :2]
-                points[1:] = points[:0:-1] + (points[0] - points[1:].mean(axis=0)) * [0, 0, 0.3]
+                points[:, 0], points[:, 1] = middle[0] - (points - middle)[:, 1], middle[1] + (points - middle)[:, 0]
             elif fault == "table":
                 points[:, 2] -= 0.08
             changed = actions.copy()
@@ -258,7 +258,8 @@ def wrong_plan(fault: str) -> Callable[[Case], Outcome]:
 
 KINDS = (
     *(Kind(name, "viperx", cases, during_motion(name)) for name, cases in (
-        ("unplugged", 14), ("silent", 14), ("garbled", 14), ("overload", 14), ("frozen", 12), ("blocked", 12), ("nan", 12),
+        ("unplugged", 14), ("silent", 14), ("garbled", 14), ("overload", 14), ("frozen", 12), ("blocked", 12),
+        ("nan", 12),
     )),
     *(Kind(name, "ur5e", cases, during_motion(name)) for name, cases in (
         ("protective-stop", 14), ("unplugged", 12), ("silent", 8), ("frozen", 8), ("nan", 8),
@@ -270,7 +271,8 @@ KINDS = (
     Kind("camera frozen", "viperx", 4, camera_fault("frozen")),
     Kind("depth of zeros", "viperx", 4, camera_fault("zeros")),
     *(Kind(f"plan: {name}", "viperx", 4, wrong_plan(fault)) for name, fault in (
-        ("jump", "jump"), ("turn", "turn"), ("into the table", "table"), ("another calibration", "cell"), ("doubt", "doubt"),
+        ("jump", "jump"), ("turn", "turn"), ("into the table", "table"), ("another calibration", "cell"),
+        ("doubt", "doubt"),
     )),
 )  # fmt: skip
 BREAKING = ("unplugged", "overload")  # the emulated cell must be started anew after these

@@ -23,8 +23,8 @@ TOOL = "tool"  # the frame between the fingertips, z along the approach, y along
 class ArmModel:
     """An arm with its gripper; see `Arm` for the units.
 
-    A user's own URDF must hold a link called `TOOL`; as many of its first joints as ``park`` has angles are the arm's, a
-    jaw after them is not.
+    A user's own URDF must hold a link called `TOOL`; as many of its first joints as ``park`` has angles are the arm's,
+    a jaw after them is not.
     """
 
     urdf: Path
