@@ -12,7 +12,7 @@ from pathlib import Path
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import DatasetError, StoppedError
+from robust_instant_policy.errors import DatasetError, StoppedError, UnreachableError
 from robust_instant_policy.files import read_regular, write_whole
 from robust_instant_policy.robots.camera import Camera
 from robust_instant_policy.robots.cell import CellConfig
@@ -20,7 +20,7 @@ from robust_instant_policy.robots.execution import is_parked, observe, park
 from robust_instant_policy.robots.journal import Episode, Journal
 from robust_instant_policy.robots.leader import Leader
 from robust_instant_policy.robots.operator import ENTER, Operator
-from robust_instant_policy.robots.recording import DISCARD, QUIT, demonstration_of, teach
+from robust_instant_policy.robots.recording import DISCARD, QUIT, demonstration_of, guide, teach
 from robust_instant_policy.robots.station import Station
 from robust_instant_policy.sanity import check_demonstrations
 
@@ -141,11 +141,20 @@ class Session:
         self._store(episode, journal, None)
 
     def _park(self) -> None:
-        if is_parked(self.station):
-            return
-        played = park(self.station, self.operator.stop, self.station.config.first_run_speed)
-        if played.stopped:
-            raise StoppedError(f"{played.stopped}; the arms hold their position")
+        """Move the arms to their park poses; where the way is refused, the person leads them nearer."""
+        operator, station = self.operator, self.station
+        while not is_parked(station):
+            try:
+                played = park(station, operator.stop, station.config.first_run_speed)
+            except UnreachableError as refused:
+                operator.say(f"  {refused}")
+                words = "hold the leader near its follower's pose; Enter couples both, q ends"
+                if operator.ask(words, ENTER + QUIT) != ENTER:
+                    raise StoppedError("the arms are not parked; they hold their position") from None
+                guide(station, self.leaders, operator, "coupled: lead the arm towards its park pose; Enter lets go")
+                continue
+            if played.stopped:
+                raise StoppedError(f"{played.stopped}; the arms hold their position")
 
 
 def keep_calibration(config: CellConfig, folder: Path) -> None:
