@@ -90,8 +90,8 @@ class Bench:
             self._emulation = self._context.__enter__()
         self._emulation.fault(self.name, "")
         with Station(self._emulation.config) as station:
-            if not is_parked(station):
-                park(station, StopRequest(), 1.0)
+            if not is_parked(station) and (stopped := park(station, StopRequest(), 1.0).stopped):
+                raise SystemExit(f"the emulated arm could not be parked for the next case: {stopped}; run again")
         return self._emulation
 
     def close(self) -> None:
