@@ -29,6 +29,7 @@ COMMANDS = {
     "view": "write a page that shows every demonstration of a folder",
     "keypoints": "write a page with the keypoints of demonstrations and new scenes, and their errors",
     "samples": "count or export the stored answers of a language model",
+    "studio": "open a page in the browser to demonstrate by hand, look at plans, and execute them",
     "robot": "check the devices of a real cell, or emulate one",
     "run": "plan for what the cell's camera sees, and execute the plan on its arms",
     "calibrate": "calibrate the camera, a gripper or a leader arm of a real cell",

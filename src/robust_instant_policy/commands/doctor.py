@@ -27,6 +27,7 @@ EXTRAS = {
     "train": ("torch", "diffusers", "transformers", "safetensors"),
     "import": ("h5py",),
     "distributed": ("ray",),
+    "studio": ("viser",),
 }
 
 

@@ -45,7 +45,7 @@ from robust_instant_policy.reporting.training import keep_training_picture
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--suite", nargs="+", metavar="SUITE", help="analyses of the paper: table1 demos queries dof downsampling "
-        "trajectories, or all; metaworld (default: --methods in --tasks, no suite)"
+        "trajectories, or all; metaworld, maniskill (default: --methods in --tasks, no suite)"
     )  # fmt: skip
     parser.add_argument("--tasks", nargs="+", metavar="TASK", help="default: push-cube, or those of the suite")
     parser.add_argument(

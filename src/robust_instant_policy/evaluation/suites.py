@@ -16,6 +16,7 @@ from robust_instant_policy.policies import METHOD_NAMES
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.tasks import UNSEEN_TASKS, require_task
 from robust_instant_policy.tasks.level import make_level
+from robust_instant_policy.tasks.maniskill_benchmark.benchmark import MANISKILL
 from robust_instant_policy.tasks.metaworld.benchmark import METAWORLD
 
 SIMULATION_TASKS = TABLE1_TASKS[:5]
@@ -183,6 +184,7 @@ _SUITES: dict[str, Callable[[Choice], tuple[Sequence[str], list[Variant]]]] = {
     ),
     "trajectories": lambda choice: (choice.tasks or ("push-cube",), _methods(choice, SAMPLING_METHODS)),
     METAWORLD.name: lambda choice: (choice.tasks or METAWORLD.tasks, _methods(choice, BENCHMARK_METHODS)),
+    MANISKILL.name: lambda choice: (choice.tasks or MANISKILL.tasks, _methods(choice, BENCHMARK_METHODS)),
 }
-BENCHMARK_SUITES = (METAWORLD.name,)
+BENCHMARK_SUITES = (METAWORLD.name, MANISKILL.name)
 SUITE_NAMES = tuple(name for name in _SUITES if name not in (CHOSEN, *BENCHMARK_SUITES))  # analyses of the paper

@@ -31,6 +31,8 @@ def group_table(benchmark: Benchmark, summary: Summary) -> Table:
     groups = {f"{name} ({len(tasks)})": tasks for name, tasks in benchmark.groups.items()}
     measured = [task for task in benchmark.tasks if task not in benchmark.tuning]
     parts = {f"tuning ({len(benchmark.tuning)})": benchmark.tuning, f"measuring ({len(measured)})": measured}
+    if not benchmark.tuning:
+        parts = {}
     rows = []
     for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
         rates = [_mean(summary, variant, tasks) for tasks in groups.values()]
@@ -43,9 +45,9 @@ def group_table(benchmark: Benchmark, summary: Summary) -> Table:
     for name, percents in benchmark.published.items():
         weighted = float(np.average(percents, weights=sizes))
         cells = [f"{percent:.1f}" for percent in percents]
-        rows.append((f"{name}, published", *cells, f"{fmean(percents):.1f}", f"{weighted:.1f}", NONE, NONE))
+        rows.append((f"{name}, published", *cells, f"{fmean(percents):.1f}", f"{weighted:.1f}", *(NONE for _ in parts)))
     head = ("method", *groups, "mean of the groups", f"mean of the {sum(sizes)} tasks", *parts)
-    return Table(head, tuple(rows), f"{_conditions(summary)} {_reading(summary)} {benchmark.protocol}")
+    return Table(head, tuple(rows), f"{_conditions(summary)} {_reading(benchmark, summary)} {benchmark.protocol}")
 
 
 def task_table(benchmark: Benchmark, summary: Summary) -> Table:
@@ -65,7 +67,8 @@ def task_table(benchmark: Benchmark, summary: Summary) -> Table:
     for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
         trials = [rate.trials for task in summary.tasks if (rate := summary.rate(variant, task)) is not None]
         counts.append(f"{label} {min(trials)}" + (f" to {max(trials)}" if max(trials) > min(trials) else ""))
-    note = f"Success in percent. {_conditions(summary)} {_reading(summary)} Executions a task: {', '.join(counts)}."
+    note = f"Success in percent. {_conditions(summary)} {_reading(benchmark, summary)}"
+    note += f" Executions a task: {', '.join(counts)}."
     return Table(("task", "group", *labels(summary.variants)), tuple(rows), note)
 
 
@@ -119,14 +122,13 @@ def _conditions(summary: Summary) -> str:
     return f"{'; '.join(words)}." if words else ""
 
 
-def _reading(summary: Summary) -> str:
+def _reading(benchmark: Benchmark, summary: Summary) -> str:
     replay = (
         "*Replay* is the demonstrator's own trajectory for the scene, thinned out to 30 waypoints and executed open "
-        "loop like a plan: where it fails, open loop cannot do it, or the demonstrator cannot. "
-        if any(variant.method == REPLAY for variant in summary.variants)
-        else ""
+        "loop like a plan: where it fails, open loop cannot do it, or the demonstrator cannot."
     )
-    return (
-        f"{replay}Tasks marked †, the tuning tasks, are those on which this package was tuned; the others were only "
-        "measured."
+    tuned = (
+        "Tasks marked †, the tuning tasks, are those on which this package was tuned; the others were only measured."
     )
+    replayed = any(variant.method == REPLAY for variant in summary.variants)
+    return " ".join([replay] * replayed + [tuned] * bool(benchmark.tuning))

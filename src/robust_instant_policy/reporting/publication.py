@@ -18,9 +18,10 @@ from robust_instant_policy.reporting.evaluation import Section, evaluation_page
 from robust_instant_policy.reporting.figures import draw, encode
 from robust_instant_policy.reporting.tables import Table, failure_table, invocation_table, tables
 from robust_instant_policy.tasks.level import make_level
+from robust_instant_policy.tasks.maniskill_benchmark.benchmark import MANISKILL
 from robust_instant_policy.tasks.metaworld.benchmark import METAWORLD
 
-BENCHMARKS = {METAWORLD.name: METAWORLD}  # suites with tables and figure of their own
+BENCHMARKS = {one.name: one for one in (METAWORLD, MANISKILL)}  # suites with tables and figure of their own
 TABLE_FILE = "table.md"
 FAILURE_TABLE_FILE = "failures.md"
 RUN_TABLE_FILE = "run.md"

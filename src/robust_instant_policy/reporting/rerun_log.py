@@ -7,40 +7,53 @@ Needs the extra `rerun`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import MissingExtraError, UsageError
-from robust_instant_policy.files import make_folder, require_replaceable
+from robust_instant_policy.errors import MissingExtraError, RipError, UsageError
+from robust_instant_policy.files import excerpt, make_folder, require_replaceable
 from robust_instant_policy.geometry import FloatArray, lift
 from robust_instant_policy.policies.policy import Plan
+from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_FILE
+from robust_instant_policy.robots.path import MeasuredPath
 from robust_instant_policy.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import rerun as rr
 
 LIVE = "live"  # in place of a file: a viewer, which is started where none runs
+DEFAULT_PORT = 9876  # of Rerun's viewer
+CONNECT_S = 5.0  # for a viewer to answer
+FLUSH_S = 120.0  # for a viewer to take what was logged
 MAX_POINTS = 40_000  # of a point cloud
 POINT_M, KEYPOINT_M, PATH_M, CANDIDATE_M = 0.0015, 0.008, 0.004, 0.002  # radii
 OPEN, CLOSED, MEASURED = (40, 120, 220), (220, 110, 30), (60, 160, 60)  # colours of a gripper, and of what it did
 KEPT, HALLUCINATED = (90, 90, 200), (200, 60, 60)  # colours of candidates
 
 
-def open_recording(where: str, name: str) -> rr.RecordingStream:
-    """A recording called ``name`` that goes into the file ``where`` (.rrd), to a viewer (`LIVE`), or to the address of
-    one (``rerun+http://…``). Raises `UsageError` for anything else, `MissingExtraError` without Rerun."""
+@contextmanager
+def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
+    """A recording called ``name``: in the file ``where`` (.rrd), shown by a viewer (`LIVE`), or sent to the address of
+    one (``rerun+http://…``). It is complete when the block ends.
+
+    Raises `UsageError` for anything else, `MissingExtraError` without Rerun, `RipError` where no viewer answers.
+    """
     try:
         import rerun as rr
     except ImportError as error:
         raise MissingExtraError("rerun-sdk", "rerun") from error
-    recording = rr.RecordingStream(f"robust-instant-policy: {name}")
+    recording = rr.RecordingStream("robust-instant-policy")
     if where == LIVE:
         recording.spawn(default_blueprint=_blueprint())
-    elif "://" in where:
+    elif where.startswith(("rerun://", "rerun+http://", "rerun+https://")):
+        _require_viewer(where)
         recording.connect_grpc(where, default_blueprint=_blueprint())
     elif where.endswith(".rrd"):
         require_replaceable(Path(where))
@@ -48,14 +61,31 @@ def open_recording(where: str, name: str) -> rr.RecordingStream:
         recording.save(where, default_blueprint=_blueprint())
     else:
         raise UsageError(f"--rerun takes a file that ends in .rrd, {LIVE!r} or the address of a viewer, not {where!r}")
+    recording.send_recording_name(name)
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    return recording
+    yield recording
+    try:
+        recording.flush(timeout_sec=FLUSH_S)
+    except (RuntimeError, ValueError) as error:
+        raise RipError(f"what was logged did not arrive at {where}: {excerpt(error)}; is a viewer there?") from None
+    finally:
+        recording.disconnect()
+
+
+def _require_viewer(address: str) -> None:
+    """Raises `RipError` where nothing listens at ``address``: the recording would wait for it."""
+    try:
+        place = urlsplit(address)
+        socket.create_connection((place.hostname or "", place.port or DEFAULT_PORT), CONNECT_S).close()
+    except (OSError, ValueError) as error:
+        raise RipError(f"no viewer answers at {address} ({error}); start one with: rerun --serve-grpc") from None
 
 
 def log_plan(
-    recording: rr.RecordingStream, observation: Observation, plan: Plan, measured: Trajectory | None = None
+    recording: rr.RecordingStream, observation: Observation, plan: Plan, measured: FloatArray | None = None
 ) -> None:
-    """Log what ``plan`` saw and chose and, where it was executed, the ``measured`` path of the gripper."""
+    """Log what ``plan`` saw and chose and, where it was executed, the way ``measured (N, A, 3)`` of the points between
+    the fingertips, metres, world."""
     import rerun as rr
 
     _log_observation(recording, observation)
@@ -67,8 +97,9 @@ def log_plan(
     _log_path(recording, "world/plan", plan.trajectory, PATH_M)
     _log_steps(recording, "world/plan/gripper", plan.trajectory)
     if measured is not None:
-        strips = [path for path in np.swapaxes(_tips(measured), 0, 1)]
-        recording.log("world/measured", rr.LineStrips3D(strips, radii=PATH_M, colors=MEASURED, labels="measured"))
+        strips = list(np.swapaxes(measured, 0, 1))
+        labels = ["measured"] * len(strips)
+        recording.log("world/measured", rr.LineStrips3D(strips, radii=PATH_M, colors=MEASURED, labels=labels))
     spread = plan.scale.reshape(len(plan.trajectory), plan.trajectory.num_arms, -1)[..., :9].mean(axis=(1, 2))
     for step, value in enumerate(spread):
         recording.set_time("step", sequence=step)
@@ -78,6 +109,12 @@ def log_plan(
     notes = "\n".join(f"- {note}" for note in plan.notes)
     text = f"# Confidence {told}\n\n{notes}"
     recording.log("notes", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+
+
+def log_run(recording: rr.RecordingStream, folder: Path) -> None:
+    """Log the plan of a run folder, and what was measured. Raises `DatasetError` where it holds no run."""
+    measured = MeasuredPath.load(folder / MEASURED_FILE).measured_tools if (folder / MEASURED_FILE).exists() else None
+    log_plan(recording, Observation.load(folder / SEEN_FILE), Plan.load(folder / PLAN_FILE), measured)
 
 
 def log_demonstrations(recording: rr.RecordingStream, demonstrations: Sequence[Demonstration]) -> None:

@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any
 
 from robust_instant_policy.errors import MissingExtraError
+from robust_instant_policy.tasks.maniskill_benchmark.benchmark import MANISKILL
 from robust_instant_policy.tasks.metaworld.benchmark import METAWORLD
 
 
@@ -41,4 +42,5 @@ FAMILIES = (
 )
 BENCHMARKS = (  # tasks of other people's packages, called BENCHMARK/NAME
     Family("metaworld.task", "metaworld", METAWORLD.tasks),
+    Family("maniskill_benchmark.task", "sim", MANISKILL.tasks),
 )

@@ -17,13 +17,14 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.waypoints import plan_onward, plan_poses, plan_waypoints
 from robust_instant_policy.tasks.demonstrator import Stroke, perform, shorter_turns
-from robust_instant_policy.tasks.level import PAPER, Layout, Level
+from robust_instant_policy.tasks.level import PAPER, Level
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image, bounded_seed
 from robust_instant_policy.trajectory import Trajectory
 
 HAND_STREAM = 1  # stream of the demonstrator's random numbers, separate from the scene's
 SEED_BITS = 32  # accepted by the simulators
+GRIPPER_DIGITS = 3  # of a measured gripper state: encoders of real grippers resolve no more
 SETTLE_SECONDS = 0.5  # at rest before a demonstration is judged
 
 Expert = Callable[[Any, np.random.Generator], Sequence[Stroke]]
@@ -63,10 +64,9 @@ class Cell(Protocol):
     ``advance`` takes one control step towards ``command (A·(J + 1),)``: for each arm the joint angles and the finger
     travel, rad and m; ``measured`` returns the same quantities, ``grip_loads (A,)`` each gripper's share of its force
     limit. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is not done,
-    empty if it is done. ``layout`` has the draws of the scene.
+    empty if it is done. ``home`` are the joint angles ``(A, J)`` at the start of the scene, of arms that start at
+    ``usual (A, J)`` unless the scene says otherwise.
     """
-
-    layout: Layout
 
     def reset(self, *, seed: int) -> Any: ...
     def photograph(self) -> Observation: ...
@@ -77,6 +77,7 @@ class Cell(Protocol):
     def tool_poses(self) -> FloatArray: ...
     def video_frame(self) -> np.ndarray: ...
     def failure(self) -> str: ...
+    def home(self, usual: FloatArray) -> FloatArray: ...
     def close(self) -> None: ...
 
 
@@ -183,19 +184,22 @@ class SimulatedTask:
         observation = self.reset(seed)
         poses, closed = self.expert_path()
         images: list[Image] = []
+        grippers: list[FloatArray] = []
         try:
             motion = plan_poses(poses, closed, self._arms, self._timing.control_hz)
         except UnreachableError as error:
             failure = str(error)
         else:
             poses, closed = motion.poses, motion.closed
-            self._play(motion, self._photographing(images, self._recorded(poses, every)) if with_images else _nothing)
+            steps = self._recorded(poses, every)
+            self._play(motion, self._observing(grippers, images if with_images else None, steps))
             self._rest(motion)
             failure = self._cell.failure()
         recorded = self._recorded(poses, every)
         trajectory = Trajectory.from_poses(poses[recorded], closed[recorded], self._triangle)
         demonstration = Demonstration(observation, trajectory, self.record_hz / every, self.name, seed)
-        return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
+        measured = np.array(grippers) if grippers else None
+        return Attempt(demonstration, not failure, failure, np.array(images) if images else None, measured)
 
     @property
     def cell(self) -> Cell:
@@ -212,7 +216,7 @@ class SimulatedTask:
     def _rebuild(self, seed: int) -> None:
         self._cell.reset(seed=bounded_seed(seed, SEED_BITS))
         self._seed, self._fresh, self._images = seed, True, 0
-        home = self._cell.layout.home(np.stack([arm.home for arm in self._usual_arms]))
+        home = self._cell.home(np.stack([arm.home for arm in self._usual_arms]))
         self._arms = [replace(arm, home=joints) for arm, joints in zip(self._usual_arms, home, strict=True)]
 
     def look(self) -> Observation:
@@ -254,13 +258,18 @@ class SimulatedTask:
 
         return before_step
 
-    def _photographing(self, images: list[Image], steps: range) -> Callable[[], None]:
-        """Returns a function to call before each control step; it appends the image to ``images`` at ``steps``."""
+    def _observing(self, grippers: list[FloatArray], images: list[Image] | None, steps: range) -> Callable[[], None]:
+        """Returns a function to call before each control step; at ``steps`` it appends the measured gripper states
+        ``(A,)`` to ``grippers``, and the image to ``images``."""
         step = count()
 
         def before_step() -> None:
             if next(step) in steps:
-                images.append(self.look().rgb)
+                travel = self._cell.measured().reshape(len(self._arms), -1)[:, -1]
+                closed = 1 - travel / [arm.finger_travel for arm in self._arms]
+                grippers.append(np.round(closed, GRIPPER_DIGITS))
+                if images is not None:
+                    images.append(self.look().rgb)
 
         return before_step
 
