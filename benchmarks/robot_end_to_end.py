@@ -18,6 +18,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -43,6 +44,7 @@ from robust_instant_policy.robots.emulation.twin import SharedTwin, TwinState
 from robust_instant_policy.robots.leaders import make_leader
 from robust_instant_policy.robots.operator import ENTER
 from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.robots.priority import DEVICE, take_real_time
 from robust_instant_policy.robots.session import Session
 from robust_instant_policy.robots.signals import StopRequest
 from robust_instant_policy.robots.station import Station
@@ -85,6 +87,7 @@ class Hand:
 
 def lead(rest: np.ndarray, travel: float, wire: Connection) -> None:
     """Emulate the leader's bus; begin the rows that come over ``wire``, until None comes."""
+    take_real_time(DEVICE)
     hand = Hand(rest)
     wire.send(ServoBus(SharedTwin(hand), 0, travel).options)
     while (rows := wire.recv()) is not None:
@@ -96,6 +99,7 @@ class Person:
 
     def __init__(self, wire: Connection):
         self.stop, self.wire = StopRequest(), wire
+        self.on_end: Callable[[], object] = lambda: None
         self.rows, self.done = np.zeros((0, 7)), np.inf
 
     def say(self, line: str) -> None:
@@ -111,6 +115,8 @@ class Person:
         return ENTER
 
     def ask(self, line: str, keys: str) -> str:
+        if "keeps it" in line:
+            self.on_end()
         return ENTER
 
 
@@ -139,7 +145,8 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
         port = DeviceConfig("aloha", MappingProxyType(ours.recv()), "leader")
         config = replace(emulation.config, arms=(replace(emulation.config.arms[0], leader=port),))
         person = Person(ours)
-        results: dict[int, str] = {}
+        results: list[str] = []
+        person.on_end = lambda: results.append(emulation.failure())
         with (
             Station(config) as station,
             DatasetWriter(folder, task.name, task.description, config.rate_hz) as writer,
@@ -150,9 +157,6 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
             seeds = iter(range(0 if writer.last_seed is None else writer.last_seed + 1, 10_000))
 
             def next_scene() -> int:
-                if results:
-                    last = max(results)
-                    results[last] = emulation.failure()
                 for seed in seeds:  # a person repeats what failed; so does the task's demonstrator
                     attempt = task.demonstrate(seed)
                     if attempt.success:
@@ -160,13 +164,10 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
                 person.rows = rows_of(attempt, arm)
                 ours.send(person.rows[:1])
                 emulation.scene(seed)
-                results[seed] = ""
                 return seed
 
             camera = make_camera(config.camera, folder)
             Session(station, [leader], camera, writer, person, lambda seen: None, next_scene).record(count)
-            if results:
-                results[max(results)] = emulation.failure()
             leader.disconnect()
     ours.send(None)
     leading.join()
@@ -175,7 +176,7 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
     return {
         "demonstrations": len(demonstrations),
         "seconds": float(np.mean([one.seconds for one in demonstrations])),
-        "done": sum(not failure for failure in results.values()),
+        "done": sum(not failure for failure in results),
         "tried": len(results),
         "jitter_median_ms": float(np.median(late)),
         "jitter_worst_ms": max(late),
@@ -256,8 +257,8 @@ def table(name: str, method: str, recorded: dict, rows: list[dict]) -> str:
         "| --- | --- |",
         f"| demonstrations at 50 Hz, mean length | {recorded['demonstrations']}, {recorded['seconds']:.1f} s |",
         f"| of them with the task done | {recorded['done']} of {recorded['tried']} |",
-        f"| jitter, 95% of the steps (median, worst demonstration) | {recorded['jitter_median_ms']:.1f} ms, "
-        f"{recorded['jitter_worst_ms']:.1f} ms |",
+        f"| jitter, 95% of the steps (median, worst demonstration) | {recorded['jitter_median_ms']:.2f} ms, "
+        f"{recorded['jitter_worst_ms']:.2f} ms |",
         f"| findings of `rip check` | {'; '.join(recorded['findings']) or 'none'} |",
     ]
     if rows:
@@ -265,9 +266,9 @@ def table(name: str, method: str, recorded: dict, rows: list[dict]) -> str:
             f"| `rip run`, plans by {method}: task done | {done} of {len(rows)} scenes ({low}% to {high}%) |",
             f"| the same plans executed by the simulated task | {same} of {len(rows)} |",
             f"| scenes in which the two differ | {sum(row['cell'] != row['simulator'] for row in rows)} |",
-            f"| jitter of `rip run`, 95% of the steps (median, worst run) | {np.median(jitter):.1f} ms, "
-            f"{max(jitter):.1f} ms |",
-            f"| largest following error | {max(following):.2f} rad |",
+            f"| jitter of `rip run`, 95% of the steps (median, worst run) | {np.median(jitter):.2f} ms, "
+            f"{max(jitter):.2f} ms |",
+            f"| largest following error | {max(following):.3f} rad |",
         ]
     load = recorded["load"]
     lines += ["", f"{os.cpu_count()} cores, no GPU; load of the machine at the end of the recording {load:.1f}."]

@@ -27,8 +27,8 @@ from robust_instant_policy.studio.session import Session
 
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SIZE, FILM_SIZE = (1200, 720), (880, 528)
-FRAME_S = 0.2  # of the film
-FASTER = 1.6  # than the page
+FRAME_S = 0.15  # of the film
+FILM_S = 24.0  # the page is shown faster if it took longer
 LONGEST_STILL_S = 0.8  # of the page; longer ones, while the model is asked, are cut
 QUALITY = 55
 KEYS = {"x": "lj", "y": "ik", "z": "uo"}  # forward and back
@@ -54,7 +54,8 @@ class Camera:
         """The pictures at the film's rate, without long stills."""
         self._client.send("Page.stopScreencast")
         taken = np.array([at for at, _ in self.frames])
-        shown = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(taken), LONGEST_STILL_S))]) / FASTER
+        shown = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(taken), LONGEST_STILL_S))])
+        shown *= min(1.0, FILM_S / shown[-1])
         chosen = np.searchsorted(shown, np.arange(0.0, shown[-1], FRAME_S), side="right") - 1
         return [self.frames[index][1].resize(FILM_SIZE, Image.Resampling.LANCZOS) for index in chosen]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from robust_instant_policy.commands.options import DATA
 from robust_instant_policy.datasets.folder import read_recording
 from robust_instant_policy.errors import MissingExtraError
+from robust_instant_policy.tasks import require_task
 
 DEFAULT_PORT, DEFAULT_TASK = 8080, "push-cube"
 
@@ -37,6 +38,8 @@ def run(options: argparse.Namespace) -> int:
             raise
         raise MissingExtraError(error.name or "viser", "studio") from error
     task = options.task or (read_recording(options.demos)["task"] if options.demos else DEFAULT_TASK)
+    if options.demos is None:
+        require_task(task)
     choice = Choice(task, options.demos, DATA / "studio", options.llm, options.observation)
     serve(choice, options.host, options.port)
     return 0

@@ -8,12 +8,14 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count as count_from
 from pathlib import Path
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, StoppedError, UnreachableError
 from robust_instant_policy.files import read_regular, write_whole
+from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.camera import Camera
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.execution import is_parked, observe, park
@@ -25,6 +27,8 @@ from robust_instant_policy.robots.station import Station
 from robust_instant_policy.sanity import check_demonstrations
 
 PREVIEW = "p"
+OPEN = 0.9  # share of its travel from which a gripper is open
+OPENING_S = 1.0
 LATE_S = 5e-3  # deviation of a step that 95% of the steps must keep within
 
 
@@ -54,6 +58,7 @@ class Session:
         self._take_up(journal)
         while self.writer.num_episodes < count:
             self._park()
+            self._open_grippers()
             seed = None if self.next_scene is None else self.next_scene()
             start = self._start(f"demonstration {self.writer.num_episodes + 1} of {count}")
             if start is None:
@@ -95,7 +100,7 @@ class Session:
             return
         late = float(demonstration.info["jitter_95_ms"])
         timing = "" if late <= 1e3 * LATE_S else ": this computer is too busy, close other programs"
-        operator.say(f"  {demonstration.seconds:.1f} s; 95% of the steps within {late:.1f} ms of their time{timing}")
+        operator.say(f"  {demonstration.seconds:.1f} s; 95% of the steps within {late:.2f} ms of their time{timing}")
         key = operator.ask("Enter keeps it, d discards it", ENTER + DISCARD)
         while key == ENTER:
             try:
@@ -139,6 +144,23 @@ class Session:
             self._discard(journal, None)
             return
         self._store(episode, journal, None)
+
+    def _open_grippers(self) -> None:
+        """A demonstration begins with open grippers; the person takes what is still held."""
+        station, operator = self.station, self.operator
+        travels = [arm.finger_travel for arm in station.arms]
+        if all(state.finger_travel > OPEN * travel for state, travel in zip(station.states(), travels, strict=True)):
+            return
+        if operator.ask("a gripper is closed: hold what it has; Enter opens it", ENTER) != ENTER:
+            raise StoppedError(f"{operator.stop.reason}; the arms hold their position")
+        steps = count_from()
+
+        def opening(states: Sequence[ArmState]) -> list[Command] | None:
+            if next(steps) > OPENING_S * station.rate_hz or operator.stop.reason:
+                return None
+            return [Command(told.joints, travel) for told, travel in zip(station.gate.last, travels, strict=True)]
+
+        station.lead(opening)
 
     def _park(self) -> None:
         """Move the arms to their park poses; where the way is refused, the person leads them nearer."""

@@ -16,8 +16,9 @@ from robust_instant_policy.studio import drawing
 from robust_instant_policy.studio.cell import Cell, Surface
 
 GIZMO_M = 0.2
+NEAR_M, FAR_M = 0.1, 20.0
 MOVED = 1e-4  # entries of a pose that change by less are not sent
-EYE, LOOK_AT = (-0.02, -0.92, 0.62), (-0.06, 0.02, 0.12)  # of a new browser, m
+EYE, LOOK_AT = (0.0, -0.85, 0.58), (-0.04, 0.03, 0.12)  # of a new browser, m
 POINT_M = 0.003
 REFUSED = (214, 40, 57)
 
@@ -31,7 +32,9 @@ class Stage:
         self._bodies: dict[str, tuple[str, Any]] = {}  # digest of its surfaces, and handle
         self._shown: dict[str, FloatArray] = {}
         self.gizmos: list[viser.TransformControlsHandle] = []
-        server.initial_camera.position, server.initial_camera.look_at = EYE, LOOK_AT
+        camera = server.initial_camera
+        camera.position, camera.look_at = EYE, LOOK_AT
+        camera.near, camera.far = NEAR_M, FAR_M  # thin discs on a table need a precise depth buffer
         self.scene.configure_environment_map(None)  # without a GPU its light takes a second a picture
         self.scene.configure_default_lights(False)
         self.scene.add_light_hemisphere(

@@ -25,6 +25,7 @@ from robust_instant_policy.robots.emulation.faults import FaultSwitch
 from robust_instant_policy.robots.emulation.servos import ServoBus
 from robust_instant_policy.robots.emulation.twin import SharedTwin, Twin
 from robust_instant_policy.robots.models import arm_of
+from robust_instant_policy.robots.priority import DEVICE, take_real_time
 
 
 class Device(Protocol):
@@ -48,6 +49,7 @@ def make_device(kind: str, twin: SharedTwin, index: int, finger_travel: float) -
 
 def serve(config: CellConfig, twin: Twin) -> None:
     """Emulate the cell until standard input ends; the first line of standard output says where its devices are."""
+    take_real_time(DEVICE)
     shared = SharedTwin(twin)
     devices = {
         one.name: make_device(one.driver.kind, shared, index, arm_of(one, config.path.parent).finger_travel)
