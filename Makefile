@@ -3,7 +3,7 @@ SHELL := /bin/bash
 RIP := .venv/bin/rip
 WORKERS := 2
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo studio test lint clean
 
 setup:
 	@scripts/setup.sh
@@ -11,6 +11,10 @@ setup:
 # ARGS are passed on: make demo ARGS="--task push-cube --seed 3"
 demo: setup
 	@$(RIP) demo $(ARGS)
+
+# The page on which a person demonstrates: make studio ARGS="--task pick-banana"
+studio: setup
+	@$(RIP) studio $(ARGS)
 
 # Installs nothing.
 lint:

@@ -1,11 +1,12 @@
 """Demonstrations through leader, bus and follower, then `rip run`, on an emulated ALOHA cell with the task's physics.
 
     python benchmarks/robot_end_to_end.py [--task aloha-pick-banana] [--demonstrations 10] [--scenes 20]
-        [--folder runs/robot-end-to-end] [--out docs/tables/robot_end_to_end.md]
+        [--llm embedded] [--folder runs/robot-end-to-end] [--out docs/tables/robot_end_to_end.md]
 
 A scripted hand moves the leader as the task's demonstrator moves: the leader's servos are on an emulated bus in a
-process of its own, as the follower's are. Both are read and written by the real drivers, at 50 Hz. The plans that
-`rip run` makes are executed by the simulator, too, in the same scenes. An interrupted run continues.
+process of its own, as the follower's are. Both are read and written by the real drivers, at 50 Hz. Without ``--llm``
+the plans are those of the nearest demonstrations (`neighbours`), which `rip run --plan` executes. The simulator
+executes the plans, too, in the same scenes. An interrupted run continues.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -30,8 +32,10 @@ from robust_instant_policy.errors import UnreachableError
 from robust_instant_policy.evaluation import scene_seed
 from robust_instant_policy.evaluation.statistics import wilson_interval
 from robust_instant_policy.motion.arm import Arm
+from robust_instant_policy.policies.neighbours import Neighbours
 from robust_instant_policy.policies.policy import Plan
-from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, RunRecord
+from robust_instant_policy.policies.settings import Settings
+from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_FILE, RunRecord, save_context
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig, DeviceConfig
 from robust_instant_policy.robots.emulation.client import emulated
@@ -40,6 +44,7 @@ from robust_instant_policy.robots.emulation.twin import SharedTwin, TwinState
 from robust_instant_policy.robots.leaders import make_leader
 from robust_instant_policy.robots.operator import ENTER
 from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.robots.priority import DEVICE, take_real_time
 from robust_instant_policy.robots.session import Session
 from robust_instant_policy.robots.signals import StopRequest
 from robust_instant_policy.robots.station import Station
@@ -51,7 +56,7 @@ REST_S = 0.4  # of the hand, after it has shown a demonstration
 CELL = """
 [cell]
 name = "end-to-end"
-workspace = [[-0.30, -0.32, -0.005], [0.22, 0.32, 0.40]]
+workspace = [[-0.40, -0.40, -0.005], [0.30, 0.40, 0.50]]
 min_confidence = 0.0
 
 [[arms]]
@@ -82,6 +87,7 @@ class Hand:
 
 def lead(rest: np.ndarray, travel: float, wire: Connection) -> None:
     """Emulate the leader's bus; begin the rows that come over ``wire``, until None comes."""
+    take_real_time(DEVICE)
     hand = Hand(rest)
     wire.send(ServoBus(SharedTwin(hand), 0, travel).options)
     while (rows := wire.recv()) is not None:
@@ -93,6 +99,7 @@ class Person:
 
     def __init__(self, wire: Connection):
         self.stop, self.wire = StopRequest(), wire
+        self.on_end: Callable[[], object] = lambda: None
         self.rows, self.done = np.zeros((0, 7)), np.inf
 
     def say(self, line: str) -> None:
@@ -108,6 +115,8 @@ class Person:
         return ENTER
 
     def ask(self, line: str, keys: str) -> str:
+        if "keeps it" in line:
+            self.on_end()
         return ENTER
 
 
@@ -136,7 +145,8 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
         port = DeviceConfig("aloha", MappingProxyType(ours.recv()), "leader")
         config = replace(emulation.config, arms=(replace(emulation.config.arms[0], leader=port),))
         person = Person(ours)
-        results: dict[int, str] = {}
+        results: list[str] = []
+        person.on_end = lambda: results.append(emulation.failure())
         with (
             Station(config) as station,
             DatasetWriter(folder, task.name, task.description, config.rate_hz) as writer,
@@ -147,9 +157,6 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
             seeds = iter(range(0 if writer.last_seed is None else writer.last_seed + 1, 10_000))
 
             def next_scene() -> int:
-                if results:
-                    last = max(results)
-                    results[last] = emulation.failure()
                 for seed in seeds:  # a person repeats what failed; so does the task's demonstrator
                     attempt = task.demonstrate(seed)
                     if attempt.success:
@@ -157,13 +164,10 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
                 person.rows = rows_of(attempt, arm)
                 ours.send(person.rows[:1])
                 emulation.scene(seed)
-                results[seed] = ""
                 return seed
 
             camera = make_camera(config.camera, folder)
             Session(station, [leader], camera, writer, person, lambda seen: None, next_scene).record(count)
-            if results:
-                results[max(results)] = emulation.failure()
             leader.disconnect()
     ours.send(None)
     leading.join()
@@ -172,7 +176,7 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
     return {
         "demonstrations": len(demonstrations),
         "seconds": float(np.mean([one.seconds for one in demonstrations])),
-        "done": sum(not failure for failure in results.values()),
+        "done": sum(not failure for failure in results),
         "tried": len(results),
         "jitter_median_ms": float(np.median(late)),
         "jitter_worst_ms": max(late),
@@ -181,13 +185,39 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
     }
 
 
-def run_scene(folder: Path, demos: Path, task: Task, index: int, llm: str) -> dict[str, object]:
+class Planner:
+    """Plans of `neighbours` from the recorded demonstrations."""
+
+    def __init__(self, demos: Path, task: Task):
+        self.demonstrations = load_demonstrations(demos)
+        self.policy = Neighbours(Settings.of("adaptive").changed(workspace=task.workspace))
+        self.policy.fit(self.demonstrations)
+
+    def write(self, config: CellConfig, task: Task, seed: int, out: Path) -> None:
+        """Write a run folder with the plan for the scene ``seed``, as `rip run --dry-run` does."""
+        seen = task.reset(seed)
+        plan = self.policy.plan(seen)
+        out.mkdir(parents=True, exist_ok=True)
+        seen.save(out / SEEN_FILE)
+        replace(plan, cell=config.digest).save(out / PLAN_FILE)
+        save_context(out, [one.observation.rgb for one in self.demonstrations], self.policy.context_.pixels)
+        RunRecord(task.name, task.goal, None, "", self.policy.name, None, "planned, not executed", ()).save(out)
+
+
+def run_scene(
+    folder: Path, demos: Path, task: Task, index: int, planner: Planner | None, llm: str
+) -> dict[str, object]:
     """`rip run` in one scene, and its plan executed by the simulator; returns the row."""
     seed = scene_seed(0, index)
     robot = write_cell(folder, task.name, seed)
     out = folder / f"run-{index}"
     command = [sys.executable, "-m", "robust_instant_policy.cli", "run", "--robot", str(robot), "--demos", str(demos)]
-    command += ["--llm", llm, "--yes", "--speed", "1", "--out", str(out)]
+    command += ["--yes", "--speed", "1"]
+    if planner is None:
+        command += ["--llm", llm, "--out", str(out)]
+    else:
+        planner.write(CellConfig.load(robot), task, seed, out)
+        command += ["--plan", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     row: dict[str, object] = {"seed": seed, "exit": done.returncode, "words": done.stderr.strip()[-300:]}
     if not (out / PLAN_FILE).exists():
@@ -217,7 +247,7 @@ def write_cell(folder: Path, task: str, seed: int) -> Path:
     return robot
 
 
-def table(name: str, recorded: dict, rows: list[dict]) -> str:
+def table(name: str, method: str, recorded: dict, rows: list[dict]) -> str:
     done, same = sum(row["cell"] for row in rows), sum(row["simulator"] for row in rows)
     low, high = (round(100 * bound) for bound in wilson_interval(done, len(rows))) if rows else (0, 100)
     jitter = [row["jitter_95_ms"] for row in rows if "jitter_95_ms" in row]
@@ -227,18 +257,18 @@ def table(name: str, recorded: dict, rows: list[dict]) -> str:
         "| --- | --- |",
         f"| demonstrations at 50 Hz, mean length | {recorded['demonstrations']}, {recorded['seconds']:.1f} s |",
         f"| of them with the task done | {recorded['done']} of {recorded['tried']} |",
-        f"| jitter, 95% of the steps (median, worst demonstration) | {recorded['jitter_median_ms']:.1f} ms, "
-        f"{recorded['jitter_worst_ms']:.1f} ms |",
+        f"| jitter, 95% of the steps (median, worst demonstration) | {recorded['jitter_median_ms']:.2f} ms, "
+        f"{recorded['jitter_worst_ms']:.2f} ms |",
         f"| findings of `rip check` | {'; '.join(recorded['findings']) or 'none'} |",
     ]
     if rows:
         lines += [
-            f"| `rip run`: task done | {done} of {len(rows)} scenes ({low}% to {high}%) |",
+            f"| `rip run`, plans by {method}: task done | {done} of {len(rows)} scenes ({low}% to {high}%) |",
             f"| the same plans executed by the simulated task | {same} of {len(rows)} |",
             f"| scenes in which the two differ | {sum(row['cell'] != row['simulator'] for row in rows)} |",
-            f"| jitter of `rip run`, 95% of the steps (median, worst run) | {np.median(jitter):.1f} ms, "
-            f"{max(jitter):.1f} ms |",
-            f"| largest following error | {max(following):.2f} rad |",
+            f"| jitter of `rip run`, 95% of the steps (median, worst run) | {np.median(jitter):.2f} ms, "
+            f"{max(jitter):.2f} ms |",
+            f"| largest following error | {max(following):.3f} rad |",
         ]
     load = recorded["load"]
     lines += ["", f"{os.cpu_count()} cores, no GPU; load of the machine at the end of the recording {load:.1f}."]
@@ -250,7 +280,7 @@ def main() -> None:
     parser.add_argument("--task", default="aloha-pick-banana", help="of one ALOHA arm")
     parser.add_argument("--demonstrations", type=int, default=10)
     parser.add_argument("--scenes", type=int, default=20)
-    parser.add_argument("--llm", default="embedded")
+    parser.add_argument("--llm", default="", help="plan with this language model (default: neighbours, without one)")
     parser.add_argument("--folder", type=Path, default=Path("runs/robot-end-to-end"))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
@@ -262,11 +292,13 @@ def main() -> None:
         config = CellConfig.load(write_cell(folder, options.task, 0))
         measured["recorded"] = record(config, task, demos, options.demonstrations)
         kept.write_text(json.dumps(measured, indent=1) + "\n")
-    for index in range(len(measured["rows"]), options.scenes):
-        measured["rows"].append(run_scene(folder, demos, task, index, options.llm))
+    indices = range(len(measured["rows"]), options.scenes)
+    planner = Planner(demos, task) if indices and not options.llm else None
+    for index in indices:
+        measured["rows"].append(run_scene(folder, demos, task, index, planner, options.llm))
         kept.write_text(json.dumps(measured, indent=1) + "\n")
         print(measured["rows"][-1], flush=True)
-    text = table(options.task, measured["recorded"], measured["rows"][: options.scenes])
+    text = table(options.task, options.llm or "neighbours", measured["recorded"], measured["rows"][: options.scenes])
     print(text)
     if options.out is not None:
         options.out.write_text(text)

@@ -144,5 +144,14 @@ if ! renderer_works; then
   renderer_works || die "the simulator still finds no renderer; see: .venv/bin/rip doctor"
 fi
 
+# The tests of `rip studio` look at its page in Chromium; without it they are skipped.
+if ! command -v chromium chromium-browser google-chrome >/dev/null; then
+  if [ -r /etc/os-release ] && [ "$(. /etc/os-release && echo "$ID")" = debian ]; then
+    apt_install chromium || say "Chromium could not be installed; the tests of rip studio will be skipped"
+  else
+    say "no Chromium: the tests of rip studio will be skipped (on Ubuntu: sudo snap install chromium)"
+  fi
+fi
+
 fingerprint >"$STAMP"
 say "done; the command is .venv/bin/rip"

@@ -2,6 +2,7 @@
 
 import shutil
 import signal
+import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,6 +42,15 @@ def workbench(tmp_path_factory, worker_id) -> Path:
             _record(shared.with_suffix(".part"))
             shared.with_suffix(".part").rename(shared)
     return Path(shutil.copytree(shared, base / "workbench"))
+
+
+@pytest.fixture(scope="session")
+def lerobot_files(tmp_path_factory) -> Path:
+    """Datasets that lerobot 0.6.1 wrote or edited (`files/make_lerobot_files.py`)."""
+    folder = tmp_path_factory.mktemp("lerobot")
+    with tarfile.open(Path(__file__).parent / "files" / "lerobot-0.6.1.tar.xz") as archive:
+        archive.extractall(folder, filter="data")
+    return folder
 
 
 def _record(folder: Path) -> None:

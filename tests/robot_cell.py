@@ -156,6 +156,7 @@ def teaches(cell, rows):
             return ""
         cell.operator.said = [line for line in cell.operator.said if "coupled" not in line]
         state.update(started=False, ended=None)
+        cell.hand.joints, cell.hand.travel = PARK, TRAVEL  # ready for the next one
         return ENTER
 
     return press

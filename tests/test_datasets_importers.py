@@ -9,13 +9,16 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
+from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations, load_frames
 from robust_instant_policy.datasets.importers import (
     GripperCommand,
+    JointModel,
     Rig,
     convert_demonstrations,
     import_demonstrations,
 )
+from robust_instant_policy.datasets.importers.rig_file import read_rig
 from robust_instant_policy.datasets.video import encode_video
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.geometry import GripperTriangle, lift, make_pose, project
@@ -141,9 +144,10 @@ def test_a_maniskill_file_without_a_success_is_refused(maniskill, tmp_path):
 
 
 def robomimic_file(path, depth=True, robot="Panda", calibrated=True):
-    environment = {
+    environment = {  # as EnvRobosuite.serialize of robomimic writes it
         "env_name": "Lift",
-        "env_type": 1,
+        "env_version": "1.5.2",
+        "type": 1,
         "env_kwargs": {"robots": [robot], "control_freq": 20, "camera_depths": depth},
     }
     with h5py.File(path, "w") as file:
@@ -213,18 +217,18 @@ def test_what_a_robomimic_file_lacks_is_said_and_what_is_known_can_be_given(tmp_
 # ---- LeRobot: several episodes in one file, as lerobot itself writes them
 
 
-def lerobot_folder(path, names, state_of, depth=True):
-    """Two episodes in one data file and one video; the poses of `demonstration` in ``observation.state``."""
+def lerobot_folder(path, names, state_of, depth=True, key="observation.state"):
+    """Two episodes in one data file and one video; the poses of `demonstration` in the feature ``key``."""
     lengths = {0: 20, 1: 30}
     states = [state_of(demonstration(seed, steps=length)) for seed, length in lengths.items()]
     columns = {
-        "observation.state": pa.array(np.concatenate(states).astype(np.float32).tolist()),
+        key: pa.array(np.concatenate(states).astype(np.float32).tolist()),
         "timestamp": np.concatenate([np.arange(length) / RATE_HZ for length in lengths.values()]),
         "frame_index": np.concatenate([np.arange(length) for length in lengths.values()]),
         "episode_index": np.repeat([0, 1], list(lengths.values())),
     }
     features = {
-        "observation.state": {"dtype": "float32", "shape": [len(names)], "names": names},
+        key: {"dtype": "float32", "shape": [states[0].shape[1]], "names": names},
         "observation.images.front": {"dtype": "video", "shape": [48, 64, 3], "names": ["height", "width", "channels"]},
     }
     if depth:
@@ -236,17 +240,17 @@ def lerobot_folder(path, names, state_of, depth=True):
     pq.write_table(pa.table(columns), path / "data/chunk-000/file-000.parquet")
     video = encode_video(np.concatenate([images(seed, length) for seed, length in lengths.items()]), RATE_HZ)
     (path / "videos/observation.images.front/chunk-000/file-000.mp4").write_bytes(video)
-    key = "videos/observation.images.front"
+    video_key = "videos/observation.images.front"
     rows = {
         "episode_index": [0, 1],
         "tasks": [["push it"], ["push it"]],
         "length": [20, 30],
         "data/chunk_index": [0, 0],
         "data/file_index": [0, 0],
-        f"{key}/chunk_index": [0, 0],
-        f"{key}/file_index": [0, 0],
-        f"{key}/from_timestamp": [0.0, 20 / RATE_HZ],
-        f"{key}/to_timestamp": [20 / RATE_HZ, 50 / RATE_HZ],
+        f"{video_key}/chunk_index": [0, 0],
+        f"{video_key}/file_index": [0, 0],
+        f"{video_key}/from_timestamp": [0.0, 20 / RATE_HZ],
+        f"{video_key}/to_timestamp": [20 / RATE_HZ, 50 / RATE_HZ],
     }
     pq.write_table(pa.table(rows), path / "meta/episodes/chunk-000/file-000.parquet")
     info = {
@@ -260,6 +264,22 @@ def lerobot_folder(path, names, state_of, depth=True):
     }
     (path / "meta/info.json").write_text(json.dumps(info))
     return path
+
+
+def add_features(path, values_of, dtype="float32"):
+    """Add features, or replace them, with the values ``(T,)`` or ``(T, 1)`` that functions make of a demonstration."""
+    file = path / "data/chunk-000/file-000.parquet"
+    table, info = pq.read_table(file), json.loads((path / "meta/info.json").read_text())
+    for key, values in values_of.items():
+        rows = np.concatenate(
+            [np.ravel(values(demonstration(seed, steps=length))) for seed, length in ((0, 20), (1, 30))]
+        )
+        if key in table.column_names:
+            table = table.drop_columns([key])
+        table = table.append_column(key, pa.array(rows, pa.float64() if dtype == "float64" else pa.float32()))
+        info["features"][key] = {"dtype": dtype, "shape": [1], "names": None}
+    pq.write_table(table, file)
+    (path / "meta/info.json").write_text(json.dumps(info))
 
 
 def end_effector(demo):
@@ -319,6 +339,274 @@ def test_what_a_lerobot_dataset_lacks_is_said(tmp_path):
     path = lerobot_folder(tmp_path / "unit", NAMES, end_effector)
     assert "unit" in refusal(import_demonstrations, path, TASK, known_rig(depth_unit_m=None))
     assert "load_frames" not in refusal(load_demonstrations, path)
+
+
+@pytest.mark.parametrize(("name", "accuracy_m"), [("depth-video", 2e-3), ("depth-mm", 1e-6), ("depth-m", 1e-6)])
+def test_depth_streams_of_lerobot_0_6_are_depth_and_no_camera(lerobot_files, name, accuracy_m):
+    demos = import_demonstrations(lerobot_files / name, TASK, known_rig(depth_key=None, depth_unit_m=None))
+    expected = (600 + np.add.outer(2 * np.arange(48), np.arange(64))) / 1000
+    for demo in demos:
+        depth = demo.observation.depth
+        assert not (depth[:4] > 0).any()  # no reading
+        np.testing.assert_allclose(depth[4:], expected[4:], atol=accuracy_m)
+        np.testing.assert_array_equal(demo.trajectory.gripper_state[:, 0], [0, 0, 0, 1, 1, 1])
+    assert [int(demo.observation.rgb.mean()) for demo in demos] == pytest.approx([40, 60], abs=2)
+
+
+def test_a_colour_video_is_no_depth(tmp_path):
+    path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector, depth=False)
+    message = refusal(import_demonstrations, path, TASK, known_rig(depth_key="observation.images.front", camera=None))
+    assert "colour video" in message
+
+
+def test_depth_in_one_row_of_numbers_takes_the_shape_of_the_image(tmp_path):
+    path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector)
+    table = pq.read_table(path / "data/chunk-000/file-000.parquet")
+    flat = [np.ravel(depth).tolist() for depth in table["observation.depth"].to_pylist()]
+    place = table.column_names.index("observation.depth")
+    pq.write_table(
+        table.set_column(place, "observation.depth", pa.array(flat)), path / "data/chunk-000/file-000.parquet"
+    )
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
+        assert np.nanmax(np.abs(demo.observation.depth - observation(seed).depth)) < 1e-3
+
+
+# ---- how people write poses
+
+
+def tilted(demo):
+    """The poses of a demonstration, with the gripper pointing down and turned: no rotation is like another one."""
+    poses = demonstration_poses(demo)
+    poses[:, :3, :3] = Rotation.from_euler("xyz", [2.8, 0.3, 0.7]).as_matrix()
+    return poses
+
+
+def layout(rotation, gripper=True):
+    def state(demo):
+        poses = tilted(demo)
+        turns = rotation(Rotation.from_matrix(poses[:, :3, :3]))
+        opening = 100 * (1 - demo.trajectory.gripper_state)
+        return np.column_stack([poses[:, :3, 3], turns, *([opening] if gripper else [])])
+
+    return state
+
+
+def rotvec(rotation):
+    return rotation.as_rotvec()
+
+
+def rpy(rotation):
+    return rotation.as_euler("xyz")
+
+
+def xyzw(rotation):
+    return rotation.as_quat()
+
+
+def wxyz(rotation):
+    return rotation.as_quat(scalar_first=True)
+
+
+@pytest.mark.parametrize(
+    ("names", "rotation", "facts"),
+    [
+        (["x", "y", "z", "rx", "ry", "rz", "gripper"], rotvec, {}),
+        (["tcp.x", "tcp.y", "tcp.z", "tcp.rx", "tcp.ry", "tcp.rz", "gripper.pos"], rpy, {"rotation": "rpy"}),
+        (["ee_x", "ee_y", "ee_z", "ee_ax", "ee_ay", "ee_az", "gripper"], rotvec, {}),
+        ({"motors": ["x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "gripper"]}, rotvec, {}),
+        ({"motors": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]}, rpy, {}),
+        ({"motors": ["x", "y", "z", "rx", "ry", "rz", "rw", "gripper"]}, xyzw, {}),
+        ({"x": 0, "y": 1, "z": 2, "qw": 3, "qx": 4, "qy": 5, "qz": 6, "gripper": 7}, wxyz, {}),
+        (["pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z", "gripper"], wxyz, {}),
+    ],
+    ids=["rx", "rpy named rx", "ax", "LIBERO", "roll", "rw", "map, qw first", "quat_"],
+)
+def test_names_of_the_axes_say_what_a_pose_is(tmp_path, names, rotation, facts):
+    path = lerobot_folder(tmp_path / "theirs", names, layout(rotation))
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig(**facts))):
+        expected = tilted(demonstration(seed, steps=len(demo.trajectory)))
+        np.testing.assert_allclose(demonstration_poses(demo), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("key", "rotation"),
+    [
+        ("observation.state.cartesian_position", rpy),
+        ("observation.ee_pose", xyzw),
+    ],
+)
+def test_poses_without_names_are_read_as_is_usual_for_their_feature(tmp_path, key, rotation):
+    path = lerobot_folder(tmp_path / "theirs", None, layout(rotation, gripper=False), key=key)
+    gripper = {"observation.gripper_position": lambda demo: 100 * (1 - demo.trajectory.gripper_state)}
+    add_features(path, gripper)
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
+        expected = tilted(demonstration(seed, steps=len(demo.trajectory)))
+        np.testing.assert_allclose(demonstration_poses(demo), expected, atol=1e-5)
+
+
+def test_quaternions_of_an_order_that_cannot_be_told_are_not_guessed(tmp_path):
+    path = lerobot_folder(tmp_path / "theirs", None, layout(wxyz, gripper=False), key="observation.ee_pose")
+    message = refusal(import_demonstrations, path, TASK, known_rig())
+    assert "both orders" in message  # as x, y, z, w, the gripper points down, too
+    assert "rotation=" in message
+    message = refusal(import_demonstrations, path, TASK, known_rig(rotation="quat_wxyz"))
+    assert "gripper" in message  # there is none; the poses are known now
+    with pytest.raises(InvalidValueError, match="quat_xyzw"):
+        known_rig(rotation="quaternion")
+
+
+def test_two_arms_are_told_apart_by_left_and_right(tmp_path):
+    def both(demo):
+        one = layout(rotvec)(demo)
+        other = one.copy()
+        other[:, 1] += 0.5
+        other[:, 6] = 100 - other[:, 6]
+        return np.column_stack([other, one])
+
+    names = [f"{arm}_{axis}" for arm in ("right", "left") for axis in ("x", "y", "z", "rx", "ry", "rz", "gripper")]
+    path = lerobot_folder(tmp_path / "theirs", names, both)
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
+        assert demo.trajectory.num_arms == 2
+        left, right = (TRIANGLE.poses(demo.trajectory.triplets[:, arm]) for arm in (0, 1))
+        original = demonstration(seed, steps=len(demo.trajectory))
+        np.testing.assert_allclose(left, tilted(original), atol=1e-5)
+        np.testing.assert_allclose(right[:, 1, 3], left[:, 1, 3] + 0.5, atol=1e-5)
+        np.testing.assert_array_equal(demo.trajectory.gripper_state.sum(axis=1), 1)
+
+
+def test_positions_in_millimetres_are_noticed_and_converted(tmp_path):
+    def millimetres(demo):
+        return end_effector(demo) * [1000, 1000, 1000, 1, 1, 1, 1]
+
+    path = lerobot_folder(tmp_path / "theirs", NAMES, millimetres)
+    assert "position_unit_m" in refusal(import_demonstrations, path, TASK, known_rig())
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig(position_unit_m=1e-3))):
+        original = demonstration(seed, steps=len(demo.trajectory))
+        np.testing.assert_allclose(demo.trajectory.actions, original.trajectory.actions, atol=1e-6)
+
+
+def test_joint_positions_and_a_urdf_become_poses(tmp_path):
+    pytest.importorskip("mink")
+    urdf = tmp_path / "arm.urdf"  # two links of 0.3 and 0.2 m that turn about z, and a lift along it
+    links = "".join(f'<link name="{name}"/>' for name in ("base", "upper", "lower", "slide", "hand"))
+    joints = "".join(
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><axis xyz="0 0 1"/>'
+        f'<origin xyz="{x} 0 0"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
+        for name, kind, parent, child, x in (
+            ("shoulder", "revolute", "base", "upper", 0),
+            ("elbow", "revolute", "upper", "lower", 0.3),
+            ("lift", "prismatic", "lower", "slide", 0.2),
+            ("wrist", "fixed", "slide", "hand", 0),
+        )
+    )
+    urdf.write_text(f'<robot name="arm">{links}{joints}</robot>')
+    turns = np.linspace(0, 1, 30)
+
+    def recorded(demo):
+        t = turns[: len(demo.trajectory)]
+        return np.column_stack([t, 2 * t, -t / 10, 100 * (1 - demo.trajectory.gripper_state)])
+
+    path = lerobot_folder(tmp_path / "theirs", ["elbow.pos", "shoulder.pos", "lift.pos", "gripper.pos"], recorded)
+    for demo in import_demonstrations(path, TASK, known_rig(joints=JointModel(urdf, "hand"))):
+        t = turns[: len(demo.trajectory)]
+        x, y = (0.3 * f(2 * t) + 0.2 * f(3 * t) for f in (np.cos, np.sin))
+        poses = demonstration_poses(demo)
+        np.testing.assert_allclose(poses[:, :3, 3], np.column_stack([x, y, -t / 10]), atol=1e-6)
+        turned = Rotation.from_rotvec(np.outer(3 * t, [0, 0, 1])).as_matrix()
+        np.testing.assert_allclose(poses[:, :3, :3], turned, atol=1e-6)
+    named = JointModel(urdf, "hand", ("shoulder", "elbow"), ("shoulder.pos", "elbow.pos"), np.pi / 180)
+    (demo, _) = import_demonstrations(path, TASK, known_rig(joints=named))
+    assert np.abs(demonstration_poses(demo)[:, 1, 3]).max() < 0.03  # the same numbers, in degrees
+    assert "hand" in refusal(import_demonstrations, path, TASK, known_rig(joints=JointModel(urdf, "tip")))
+    wrong = JointModel(urdf, "hand", ("shoulder",), ("pan",))
+    assert "shoulder" in refusal(import_demonstrations, path, TASK, known_rig(joints=wrong))
+    urdf.write_text("<robot>")
+    assert "URDF" in refusal(import_demonstrations, path, TASK, known_rig(joints=JointModel(urdf, "hand")))
+
+
+# ---- times
+
+
+@pytest.mark.parametrize("unit_s", [1.0, 1e-3, 1e-9], ids=["s", "ms", "ns"])
+def test_frames_at_uneven_times_of_day_are_resampled(tmp_path, unit_s):
+    path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector)
+    moments = {}
+
+    def stamps(demo):
+        steps = len(demo.trajectory)
+        gaps = np.random.default_rng(steps).uniform(0.5, 2.5, steps) / RATE_HZ
+        moments[steps] = np.cumsum(gaps) - gaps[0]
+        return (1.76e9 + moments[steps]) / unit_s
+
+    add_features(path, {"timestamp": stamps}, dtype="float64")
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
+        original = demonstration(seed, steps=(20, 30)[seed])
+        seconds = moments[len(original.trajectory)]
+        assert demo.seconds == pytest.approx(seconds[-1], abs=1 / RATE_HZ)
+        times = np.arange(len(demo.trajectory)) / RATE_HZ
+        for column in (0, 4, 8):
+            wanted = np.interp(times, seconds, original.trajectory.actions[:, column])
+            np.testing.assert_allclose(demo.trajectory.actions[:, column], wanted, atol=2e-5)
+    assert convert_demonstrations(path, tmp_path / "ours", TASK, DESCRIPTION, known_rig()) == 2
+    ours = load_demonstrations(tmp_path / "ours")
+    assert len(list(load_frames(tmp_path / "ours", 1))) == len(ours[1].trajectory)
+    known = import_demonstrations(path, TASK, known_rig(rate_hz=10.0))  # the user knows better
+    assert [len(demo.trajectory) for demo in known] == [20, 30]
+
+
+def test_times_that_go_back_are_refused(tmp_path):
+    path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector)
+    add_features(path, {"timestamp": lambda demo: -np.arange(len(demo.trajectory))}, dtype="float64")
+    assert "do not increase" in refusal(import_demonstrations, path, TASK, known_rig())
+
+
+# ---- the command
+
+
+def test_recordings_are_imported_from_the_command_line(tmp_path, capsys):
+    path, out, rig = lerobot_folder(tmp_path / "theirs", NAMES, end_effector), tmp_path / "ours", tmp_path / "rig.json"
+    command = ["import", str(path), "--rig", str(rig), "--task", TASK, "--out", str(out)]
+    content = {"triangle": {"length": 0.1, "opening": 0.08}, "gripper": {"open": 100, "closed": 0}}
+    rig.write_text(json.dumps(content))
+    assert main(command) == 1
+    assert "intrinsics" in capsys.readouterr().err
+    seen = observation(0)
+    content |= {
+        "intrinsics": seen.intrinsics.tolist(),
+        "camera_pose": seen.camera_pose.tolist(),
+        "tool": TOOL.tolist(),
+        "depth_key": "observation.depth",
+        "depth_unit_m": 0.001,
+    }
+    rig.write_text(json.dumps(content))
+    assert main(command) == 0
+    assert "2 demonstrations" in capsys.readouterr().out
+    for seed, demo in enumerate(load_demonstrations(out)):
+        original = demonstration(seed, steps=len(demo.trajectory))
+        np.testing.assert_allclose(demo.trajectory.actions, original.trajectory.actions, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({}, "triangle"),
+        ({"triangle": {"length": 0.1}}, "opening"),
+        ({"triangle": 3}, "triangle"),
+        ({"intrinsic": 1}, "'intrinsic'"),
+        ({"intrinsics": [[1, 2]]}, "(3, 3)"),
+        ({"depth_unit_m": "mm"}, "number"),
+        ({"camera": 3}, "text"),
+        ({"rotation": "quat"}, "quat_xyzw"),
+        ({"joints": {"urdf": "arm.urdf"}}, "link"),
+    ],
+)
+def test_a_wrong_description_of_a_rig_is_said_in_one_line(tmp_path, content, said):
+    path = tmp_path / "rig.json"
+    whole = {"triangle": {"length": 0.1, "opening": 0.08}} | content if content else {}
+    path.write_text(json.dumps(whole))
+    message = refusal(read_rig, path)
+    assert said in message
+    assert "rig.json" in message
 
 
 def test_files_of_no_known_kind_are_refused(tmp_path):

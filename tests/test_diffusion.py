@@ -1,5 +1,6 @@
 import shutil
 from contextlib import closing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -191,8 +192,8 @@ def _drives_the_simulator(policy):
         rate_hz = policy.rate_hz
         controller = policy.controller(task.reset(0))
 
-        def act(self, image, action):
-            waypoints = self.controller.act(image, action)
+        def act(self, observation, action):
+            waypoints = self.controller.act(observation, action)
             commanded.append(waypoints)
             return waypoints
 
@@ -210,7 +211,7 @@ def test_a_policy_that_wants_to_stay_where_it_is_is_done(filmed, small_images, t
     controller = policy.controller(None)
     here = np.append(np.linspace(0.1, 0.2, 9), 0.0)
     monkeypatch.setattr(controller, "planned", lambda seen: np.tile(here, (dp.EXECUTED, 1)))
-    image = np.zeros((64, 64, 3), np.uint8)
+    image = SimpleNamespace(rgb=np.zeros((64, 64, 3), np.uint8))
     assert [controller.act(image, here) is None for _ in range(5)] == [False] * 4 + [True]
 
 

@@ -13,6 +13,7 @@ from robust_instant_policy.robots.calibration import (
     Board,
     CameraCalibration,
     calibrate_tool,
+    check_camera,
     in_hand,
     on_table,
     pivot,
@@ -99,12 +100,12 @@ def test_a_calibration_file_is_read_back_and_serves_the_cell(table, tmp_path):
     np.testing.assert_array_equal(again.pose, result.pose)
     np.testing.assert_array_equal(read_camera_pose(tmp_path / "camera.toml"), result.pose)
     assert again.board == BOARD
-    again.check("realsense 1", frames[0])
+    check_camera(tmp_path / "camera.toml", "realsense 1", frames[0])
     with pytest.raises(RobotError, match="realsense 2 is connected; run rip calibrate camera"):
-        again.check("realsense 2", frames[0])
+        check_camera(tmp_path / "camera.toml", "realsense 2", frames[0])
     wider = replace(frames[0], intrinsics=INTRINSICS * np.array([[0.75], [1], [1]]))
     with pytest.raises(RobotError, match="another crop"):
-        again.check("realsense 1", wider)
+        check_camera(tmp_path / "camera.toml", "realsense 1", wider)
 
 
 def test_a_square_of_another_size_is_told_with_the_size_that_would_agree(table):

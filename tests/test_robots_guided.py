@@ -2,6 +2,7 @@
 
 import itertools
 import os
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -12,16 +13,16 @@ pytest.importorskip("dynamixel_sdk")
 from robust_instant_policy.cli import main
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import GripperTriangle, invert_pose, make_pose, transform_points
-from robust_instant_policy.robots.calibration import Board, CameraCalibration, on_table, touched_place
+from robust_instant_policy.robots.calibration import Board, CameraCalibration, in_hand, on_table, touched_place
 from robust_instant_policy.robots.calibration.guided import Guide, photograph_places
 from robust_instant_policy.robots.camera import Frame
-from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.cell import CellConfig, read_gripper, read_tool
 from robust_instant_policy.robots.leaders import make_leader
 from robust_instant_policy.robots.models import arm_of
 from robust_instant_policy.robots.operator import ENTER
 from robust_instant_policy.robots.station import Station
 from tests.charuco import INTRINSICS, error_of, photograph
-from tests.robot_cell import CELL, PARK, Cell, Scripted
+from tests.robot_cell import CELL, PARK, TRAVEL, Cell, Scripted
 
 BOARD = Board()
 CAMERA = make_pose(Rotation.from_euler("xyz", [180, 2, -90], degrees=True).as_matrix(), [-0.05, 0.0, 0.85])
@@ -98,6 +99,90 @@ def test_a_person_who_touches_the_board_and_moves_it_over_the_table_calibrates_t
         cell.unplug()
 
 
+TIP = make_pose(np.eye(3), [0.001, -0.003, 0.004])  # the gripper's true tool frame in that of the arm's model
+SCREW = np.array([-0.15, 0.05, 0.12])  # the fixed point to touch
+TILTS = ([0, 0, 0], [0, 25, 0], [0, -25, 0], [25, 0, 0], [-25, 0, 0], [0, 15, 60])
+
+
+class Pivoting(Scripted):
+    """Touches a point with one finger after the other, from the directions that are asked for."""
+
+    def __init__(self, cell, arm):
+        super().__init__([("Enter", ENTER)], self.arrived)
+        self.cell, self.arm, self.touches, self.coupled = cell, arm, 0, False
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        """Nothing to restore."""
+
+    def say(self, line):
+        super().say(line)
+        hand = self.cell.hand
+        if "touch a fixed point" in line:
+            finger, way = divmod(self.touches, len(TILTS))
+            self.touches += 1
+            turn = Rotation.from_euler("x", np.pi) * Rotation.from_euler("xyz", TILTS[way], degrees=True)
+            tip = transform_points(TIP, [0, (TRAVEL, -TRAVEL)[finger], 0])
+            pose = make_pose(turn.as_matrix(), SCREW - turn.apply(tip))
+            hand.joints, hand.travel = (
+                self.arm.kinematics.follow(np.repeat(pose[None], 9, axis=0), hand.joints).joints[-1],
+                TRAVEL,
+            )
+        elif "the gripper, free" in line:
+            hand.travel = 0.0 if line.startswith("close") else TRAVEL
+        self.coupled = line.startswith("coupled") or (self.coupled and "touch" not in line)
+
+    def arrived(self):
+        state = self.cell.twin.state(0)
+        gap = max(np.abs(state.joints - self.cell.hand.joints).max(), abs(state.finger_travel - self.cell.hand.travel))
+        return ENTER if self.coupled and gap < 1e-3 else ""
+
+
+MOUNTING = make_pose(Rotation.from_euler("x", np.pi).as_matrix(), [-0.12, 0.09, 0.06])  # board -> hand, facing up
+HELD = ([0, 0, 0], [0, 20, 0], [0, -20, 10], [20, 0, 0], [-20, 0, -10], [15, 15, 30], [-15, -15, -30], [0, 0, 60])
+
+
+class Holding(Pivoting):
+    """Turns the hand to another pose at each question, one of them with the board out of the camera's view."""
+
+    def say(self, line):
+        Scripted.say(self, line)
+        if line.startswith("pose"):
+            way, self.touches = self.touches, self.touches + 1
+            turn = Rotation.from_euler("x", np.pi) * Rotation.from_euler("xyz", HELD[max(way - 1, 0)], degrees=True)
+            pose = make_pose(turn.as_matrix(), [-0.15, 0.36 if way == 0 else 0.05 * np.sin(way), 0.25])
+            self.cell.hand.joints = self.arm.kinematics.follow(
+                np.repeat(pose[None], 9, axis=0), self.cell.hand.joints
+            ).joints[-1]
+        self.coupled = line.startswith("coupled") or (self.coupled and not line.startswith("pose"))
+
+
+def test_a_board_in_the_hand_calibrates_the_camera(tmp_path):
+    cell = Cell(tmp_path)
+    rng = np.random.default_rng(0)
+
+    class Top:
+        def read(self):
+            hand = operator.arm.kinematics.tool_pose(cell.twin.state(0).joints)
+            rgb, depth = photograph(BOARD, invert_pose(CAMERA) @ hand @ MOUNTING, rng)
+            return Frame(rgb, depth, INTRINSICS, 0.0)
+
+    try:
+        with Station(cell.config) as station:
+            operator = Holding(cell, station.arms[0])
+            leader = make_leader(cell.config.arms[0], station.arms[0], 50.0, tmp_path, operator.pressed)
+            leader.connect()
+            frames, hands = Guide(station, leader, 0, operator).held_board(Top(), BOARD, len(HELD))
+        assert any("not usable" in line for line in operator.said)
+        distance, angle = error_of(in_hand("top", frames, hands, BOARD).pose, CAMERA)
+        assert distance < 3.0
+        assert angle < 0.4
+    finally:
+        cell.unplug()
+
+
 def answer(monkeypatch, text):
     """Give ``text`` as the lines that are typed."""
     read, write = os.pipe()
@@ -155,3 +240,33 @@ def test_wrong_usage_is_one_line(arguments, words, tmp_path, monkeypatch, capsys
     monkeypatch.chdir(tmp_path)
     assert main(["calibrate", *arguments]) != 0
     assert words in capsys.readouterr().err
+
+
+def test_the_command_measures_a_gripper_by_touching_a_point_with_both_fingers(tmp_path, monkeypatch, capsys):
+    cell = Cell(tmp_path)
+    operators = []
+
+    def person(stop, say):
+        operators.append(Pivoting(cell, arm_of(cell.config.arms[0], tmp_path)))
+        operators[0].stop = stop
+        return operators[0]
+
+    monkeypatch.setattr("robust_instant_policy.commands.calibrate.Terminal", person)
+    monkeypatch.setattr("robust_instant_policy.commands.calibrate.CellConfig.load", lambda path: cell.config)
+    monkeypatch.setattr(
+        "robust_instant_policy.commands.calibrate.emulated", lambda config: nullcontext(Emulated(config))
+    )
+    try:
+        out = tmp_path / "gripper.toml"
+        assert main(["calibrate", "tool", "--robot", str(cell.file), "--out", str(out)]) == 0, capsys.readouterr().err
+        assert read_gripper(out).opening == pytest.approx(2 * TRAVEL, abs=0.002)  # the encoders' steps are 0.8 mm here
+        np.testing.assert_allclose(read_tool(out)[:3, 3], TIP[:3, 3], atol=0.002)
+    finally:
+        cell.unplug()
+
+
+class Emulated:
+    """The devices of the cell are emulated in this process."""
+
+    def __init__(self, config):
+        self.config = config

@@ -78,6 +78,9 @@ def test_a_discarded_demonstration_is_counted_and_recorded_again(cell, tmp_path)
     assert record(cell, out, rules) == 1
     with DatasetWriter(out, "turn", "turn it", 50) as writer:
         assert (writer.num_episodes, writer.discarded) == (1, 1)
+    assert sum("a gripper is closed" in line for line in cell.operator.said) == 1
+    (demonstration,) = load_demonstrations(out)
+    assert demonstration.trajectory.gripper_state[0, 0] == 0
 
 
 def test_an_arm_that_did_not_move_makes_no_demonstration(cell, tmp_path):

@@ -14,8 +14,8 @@ class Replay:
         self.actions, self.rate_hz, self.chunk = actions, rate_hz, chunk
         self.images, self.seen, self.next = [], [], 0
 
-    def act(self, image, action):
-        self.images.append(image)
+    def act(self, observation, action):
+        self.images.append(observation.rgb)
         self.seen.append(action)
         waypoints = self.actions[self.next : self.next + self.chunk]
         self.next += self.chunk

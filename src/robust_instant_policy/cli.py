@@ -21,12 +21,15 @@ COMMANDS = {
     "plan": "plan for one observation and write plan.json; nothing is executed",
     "serve": "plan for robots that ask over openpi's websocket protocol or HTTP",
     "eval": "run the paper's evaluation, or a part of it; continues an interrupted run",
+    "import": "write the demonstrations of ManiSkill, robomimic or LeRobot recordings into a folder",
+    "demos": "delete, split, merge or restore demonstrations",
     "train": "train dp or kat-dp on demonstrations; continues an interrupted training",
     "report": "write the report of a run, or of an evaluation, again",
     "merge": "combine several evaluations in one folder",
     "view": "write a page that shows every demonstration of a folder",
     "keypoints": "write a page with the keypoints of demonstrations and new scenes, and their errors",
     "samples": "count or export the stored answers of a language model",
+    "studio": "open a page in the browser to demonstrate by hand, look at plans, and execute them",
     "robot": "check the devices of a real cell, or emulate one",
     "run": "plan for what the cell's camera sees, and execute the plan on its arms",
     "calibrate": "calibrate the camera, a gripper or a leader arm of a real cell",
@@ -81,7 +84,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         command = commands.add_parser(name, help=summary, description=summary)
         command.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
         if name == chosen:
-            module = importlib.import_module(f"robust_instant_policy.commands.{name.replace('-', '_')}")
+            place = "import_" if name == "import" else name.replace("-", "_")  # a keyword cannot name a module
+            module = importlib.import_module(f"robust_instant_policy.commands.{place}")
             module.add_arguments(command)
             command.set_defaults(run=module.run)
     return parser.parse_args(arguments)

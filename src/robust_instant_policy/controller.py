@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray
 
 
 class Controller(Protocol):
     """A policy in closed loop: it looks again while it moves."""
 
-    rate_hz: float  # of the waypoints it commands
+    @property
+    def rate_hz(self) -> float | None:
+        """Of the waypoints it commands; None: that of the task's executed waypoints."""
+        ...
 
-    def act(self, image: NDArray[np.uint8], action: FloatArray) -> FloatArray | None:
+    def act(self, observation: Observation, action: FloatArray) -> FloatArray | None:
         """The next waypoints ``(N, 10·A)``, N >= 1, each an action as in `Trajectory`; None once it is done.
 
-        ``image (H, W, 3)`` uint8 is what the camera of the start observation sees now, ``action (10·A,)`` where the
-        grippers are now (points in metres, world frame) with the state they were last told to take.
+        ``observation`` is what the camera of the start observation sees now, ``action (10·A,)`` where the grippers are
+        now (points in metres, world frame) with the state they were last told to take.
         """
         ...

@@ -38,10 +38,13 @@ class MissingExtraError(RipError):
 
 
 def install_command(extra: str) -> str:
-    """What installs an extra. On Python 3.13 two simulators must be installed without the packages they require."""
+    """What installs an extra. Simulators that require packages which are too old, or are not there for Python 3.13, are
+    installed without them."""
     command = f"pip install 'robust-instant-policy[{extra}]'"
-    simulator = {"sim": "mani_skill", "aloha": "gym-aloha"}.get(extra)
-    return f"{command} && pip install --no-deps {simulator}" if simulator and sys.version_info >= (3, 13) else command
+    simulator = {"metaworld": "metaworld"}.get(extra)
+    if sys.version_info >= (3, 13):
+        simulator = simulator or {"sim": "mani_skill", "aloha": "gym-aloha"}.get(extra)
+    return f"{command} && pip install --no-deps {simulator}" if simulator else command
 
 
 class MissingMethodError(UsageError):

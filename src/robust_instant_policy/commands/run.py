@@ -31,7 +31,7 @@ from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.client import Emulation, devices_of
 from robust_instant_policy.robots.execution import is_parked, observe, park, require_trust
 from robust_instant_policy.robots.signals import stop_on_signals
-from robust_instant_policy.robots.station import Station
+from robust_instant_policy.robots.station import Played, Station
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -91,13 +91,13 @@ class _Run:
             self._confirm(f"execute {seconds:.0f} s of motion at {100 * self._speed:.0f}% of the usual speed?")
             with self._screen.stage("execution"), stop_on_signals() as stop:
                 played = station.play(motion, stop)
-            names = [arm.name for arm in station.arms]
             played.path.save(self._out / MEASURED_FILE)
-            failure = played.stopped or "; ".join(played.path.empty_grasps(names)) or self._judge()
-            self._report(record, not failure, f"failed: {failure}" if failure else "success")
+            success, outcome = self._judge(played)
+            grasps = played.path.empty_grasps([arm.name for arm in station.arms])
+            self._report(record, success, "; ".join([outcome, *grasps]))
             if played.stopped:
                 raise StoppedError(f"{played.stopped}; the arms hold their position")
-        if not failure:
+        if success is not False:
             write_whole(self._done, b"")
 
     def _park(self, station: Station) -> None:
@@ -173,15 +173,19 @@ class _Run:
             finally:
                 camera.disconnect()
 
-    def _judge(self) -> str:
-        """Why the task is not done, empty if it is: from the emulation, or from the person."""
+    def _judge(self, played: Played) -> tuple[bool | None, str]:
+        """Whether the task is done, None if nobody says, and the outcome in words."""
+        if played.stopped:
+            return False, f"stopped: {played.stopped}"
         if self._emulation is not None:
-            return self._emulation.failure()
+            failure = self._emulation.failure()
+            return not failure, f"failed: {failure}" if failure else "success"
         if self._options.yes:
-            return ""
-        return "" if _agrees("did it succeed?") else "judged a failure"
+            return None, "executed, not judged"
+        success = _agrees("did it succeed?")
+        return success, "success" if success else "failed: judged so"
 
-    def _report(self, record: RunRecord, success: bool, outcome: str) -> None:
+    def _report(self, record: RunRecord, success: bool | None, outcome: str) -> None:
         replace(record, success=success, outcome=outcome, stages=tuple(self._screen.stages)).save(self._out)
         self._screen.say(outcome)
         self._screen.say(f"report: {write_report(self._out)}")

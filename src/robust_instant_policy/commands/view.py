@@ -1,19 +1,29 @@
-"""`rip view`: write a page that shows every demonstration of a folder."""
+"""`rip view`: write a page that shows every demonstration of a folder, or log them for Rerun."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from robust_instant_policy.commands.options import beside
+from robust_instant_policy.commands.options import add_rerun, beside
+from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.reporting.demonstrations import write_page
+from robust_instant_policy.reporting.rerun_log import log_demonstrations, open_recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR.html)")
+    add_rerun(parser)
 
 
 def run(options: argparse.Namespace) -> int:
+    if options.rerun is not None:
+        demonstrations = load_demonstrations(options.demos)
+        with open_recording(options.rerun, demonstrations[0].task or "demonstrations") as recording:
+            log_demonstrations(recording, demonstrations)
+        print(options.rerun)
+        if options.out is None:
+            return 0
     print(write_page(options.demos, options.out or beside(options.demos, ".html")))
     return 0

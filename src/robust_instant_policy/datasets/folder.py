@@ -27,7 +27,12 @@ from robust_instant_policy.errors import DatasetError, NoDemonstrationsError
 from robust_instant_policy.files import excerpt, finished_files, open_regular, read_json
 from robust_instant_policy.geometry import FloatArray
 
-CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
+# In lerobot 0.6 --root is the folder itself, in 0.4 its parent.
+CONVERT = (
+    "convert it with: python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={name} --root={path} "
+    "--push-to-hub=false (lerobot 0.6; with 0.4: python -m lerobot.datasets.v30.convert_dataset_v21_to_v30 "
+    "--repo-id={name} --root={parent} --push-to-hub=false)"
+)
 STATISTICS_PREFIX = "stats/"  # columns of meta/episodes that are used for normalisation only
 INFO_ENTRIES = ("codebase_version", "fps", "features", "total_episodes", "total_frames", "data_path")
 MAX_INDEX = 2**31  # of an episode, file, chunk or frame
@@ -80,8 +85,8 @@ class Folder:
                 f"{self.root} is damaged: episode {episode}: {name} {excerpt(error)}; {REPAIR}"
             ) from None
 
-    def frames(self, episode: int, key: str) -> Iterator[NDArray]:
-        """Images ``(H, W, 3)`` uint8 of an episode's video feature ``key``, in order."""
+    def frames(self, episode: int, key: str, pixel_format: str = "rgb24") -> Iterator[NDArray]:
+        """Images of an episode's video ``key``, in order: ``(H, W, 3)`` uint8, or of another ``pixel_format``."""
         row = self.episodes[episode]
         video = f"videos/{key}"
         wanted = {f"{video}/{name}": low for name, low in (("chunk_index", 0), ("file_index", 0))}
@@ -99,7 +104,7 @@ class Folder:
             file_index=row[f"{video}/file_index"],
         )
         count = 0
-        for image in decode_video(path, start, stop):
+        for image in decode_video(path, start, stop, pixel_format):
             count += 1
             if count > row["length"]:
                 break
@@ -138,7 +143,8 @@ def open_folder(path: Path, task: str | None = None) -> Folder:
         raise DatasetError(f"{file} lacks {', '.join(missing)}; restore it, or record again")
     version = info["codebase_version"]
     if not (isinstance(version, str) and version.startswith("v3.")):
-        convert = f"; convert it with: {CONVERTER} --repo-id=NAME --root={path} --push-to-hub=false"
+        own = path.resolve()
+        convert = "; " + CONVERT.format(name=own.name, path=own, parent=own.parent)
         raise DatasetError(
             f"{path} is a LeRobotDataset {reprlib.repr(version)}, and {layout.CODEBASE_VERSION} is needed"
             + (convert if version == "v2.1" else "")

@@ -33,8 +33,8 @@ def load_demonstrations(path: str | Path, task: str | None = None, limit: int | 
     folder = open_folder(root, task)
     if not (root / layout.RIP_PATH).exists():
         raise DatasetError(
-            f"{root} was not recorded by rip: it holds no start-of-episode depth and camera ({layout.RIP_PATH}); "
-            "if its actions are end-effector poses, convert it with robust_instant_policy.datasets.importers"
+            f"{root} was not recorded by rip, or was edited by other software: it holds no start-of-episode depth and "
+            f"camera ({layout.RIP_PATH}); {_advice(folder)}"
         )
     name = read_recording(root)["task"]
     if task is not None and name != task:
@@ -44,6 +44,14 @@ def load_demonstrations(path: str | Path, task: str | None = None, limit: int | 
         )
     count = len(folder.episodes) if limit is None else min(limit, len(folder.episodes))
     return [_read_demonstration(folder, episode, name) for episode in range(count)]
+
+
+def _advice(folder: Folder) -> str:
+    """How to make demonstrations of a folder without their start: it was ours, or is somebody else's."""
+    action = folder.info["features"].get(layout.ACTION_KEY, {})
+    if action.get("names") in (layout.axis_names(arms) for arms in (1, 2)):
+        return f"take these from the folder that was edited: rip demos restore {folder.root} --from ORIGINAL --out NEW"
+    return f"if it holds end-effector poses, convert it with: rip import {folder.root} (docs/importing.md)"
 
 
 def load_frames(path: str | Path, episode: int) -> Iterator[NDArray[np.uint8]]:

@@ -116,8 +116,10 @@ def encode_video(images: NDArray[np.uint8], rate_hz: float) -> bytes:
     return encoder.finish()
 
 
-def decode_video(path: Path, start_s: float = 0.0, stop_s: float = float("inf")) -> Iterator[NDArray[np.uint8]]:
-    """Frames ``(H, W, 3)`` uint8 of ``path`` shown within ``[start_s, stop_s)``.
+def decode_video(
+    path: Path, start_s: float = 0.0, stop_s: float = float("inf"), pixel_format: str = "rgb24"
+) -> Iterator[NDArray]:
+    """Frames ``(H, W, 3)`` uint8 of ``path`` shown within ``[start_s, stop_s)``, or in another ``pixel_format``.
 
     Raises `DatasetError` for a missing file or another format.
     """
@@ -135,6 +137,6 @@ def decode_video(path: Path, start_s: float = 0.0, stop_s: float = float("inf"))
                 if (frame.width, frame.height) != (stream.width, stream.height):
                     raise DatasetError(f"{path} holds images of several sizes: restore it, or record the folder again")
                 if frame.time >= start_s - half_frame:
-                    yield frame.to_ndarray(format="rgb24")
+                    yield frame.to_ndarray(format=pixel_format)
     except (OSError, ValueError, IndexError, TypeError, ArithmeticError, MemoryError, av.FFmpegError) as error:
         raise DatasetError(f"{path} cannot be read as a video: restore it, or record the folder again") from error

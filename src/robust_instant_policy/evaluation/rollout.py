@@ -7,9 +7,6 @@ from collections.abc import Collection, Iterator
 from functools import partial
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError, PlanningError, UnreachableError
@@ -110,8 +107,8 @@ class _Timed:
         self.rate_hz = controller.rate_hz
         self.seconds = 0.0
 
-    def act(self, image: NDArray[np.uint8], action: FloatArray) -> FloatArray | None:
+    def act(self, observation: Observation, action: FloatArray) -> FloatArray | None:
         start = time.perf_counter()
-        waypoints = self._controller.act(image, action)
+        waypoints = self._controller.act(observation, action)
         self.seconds += time.perf_counter() - start
         return waypoints

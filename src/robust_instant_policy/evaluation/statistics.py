@@ -17,8 +17,7 @@ from scipy import stats
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.suites import Suite
-from robust_instant_policy.evaluation.variant import Scene, Variant
-from robust_instant_policy.policies import METHOD_NAMES
+from robust_instant_policy.evaluation.variant import ROW_METHODS, Scene, Variant
 
 MARKS = ((5e-3, "**"), (5e-2, "*"))  # the paper's, below these p-values
 CONFIDENCE = 0.95
@@ -209,7 +208,7 @@ class Summary:
         self.rows: list[Episode] = [row for rows in self._rows.values() for row in rows]
         known = [variant for variant, rows in self._rows.items() if rows]
         # whatever the order in which they were asked for, run by run
-        self.variants: list[Variant] = sorted(known, key=lambda variant: METHOD_NAMES.index(variant.method))
+        self.variants: list[Variant] = sorted(known, key=lambda variant: ROW_METHODS.index(variant.method))
         self.tasks: list[str] = [task for task in suite.tasks if any(row.scene.task == task for row in self.rows)]
 
     def rate(self, variant: Variant, task: str | None = None) -> Rate | None:

@@ -10,12 +10,14 @@ from typing import Any
 from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.evaluation.paper import TABLE1_TASKS
 from robust_instant_policy.evaluation.scenes import scene_seed, split_of
-from robust_instant_policy.evaluation.variant import Scene, Variant, configs, require_no_path
+from robust_instant_policy.evaluation.variant import REPLAY, ROW_METHODS, Scene, Variant, configs, require_no_path
 from robust_instant_policy.files import file_stem
 from robust_instant_policy.policies import METHOD_NAMES
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.tasks import UNSEEN_TASKS, require_task
 from robust_instant_policy.tasks.level import make_level
+from robust_instant_policy.tasks.maniskill_benchmark.benchmark import MANISKILL
+from robust_instant_policy.tasks.metaworld.benchmark import METAWORLD
 
 SIMULATION_TASKS = TABLE1_TASKS[:5]
 # "tasks in which gripper actions were essential"
@@ -26,6 +28,7 @@ DOFS = (1.25, 1.5, 3.0, math.inf)
 HYPERPARAMETER_DEMOS = 20  # shown where Q and ν are varied
 CHOSEN = "chosen"  # not an analysis of the paper: what the user's tasks and methods say
 SAMPLING_METHODS = ("rip", "rip-gauss", "mean", "kat")  # those that share their samples
+BENCHMARK_METHODS = (REPLAY, "neighbours", "gp", "kat", "rip-gauss", "rip")
 PAPER_METHODS = (*SAMPLING_METHODS, "dp", "kat-dp")  # those that there are in the paper's configuration, by default
 
 
@@ -49,8 +52,8 @@ class Suite:
         require_no_path(self.name, self.objects, self.assets, self.level)
         require_no_path(*map(file_stem, self.tasks))
         for variant in self.variants:
-            if variant.method not in METHOD_NAMES:
-                raise UnknownNameError("method", variant.method, METHOD_NAMES)
+            if variant.method not in ROW_METHODS:
+                raise UnknownNameError("method", variant.method, ROW_METHODS)
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> Suite:
@@ -131,7 +134,7 @@ class Choice:
 
 
 def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:
-    """The analyses called ``names``, of which "all" stands for every one.
+    """The analyses called ``names``, of which "all" stands for every one of the paper.
 
     Raises `UnknownNameError` for others, and `UsageError` for scenes of a seed that do not lie in the chosen split.
     """
@@ -145,7 +148,7 @@ def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:
     suites = []
     for name in dict.fromkeys(wanted):
         if name not in _SUITES:
-            raise UnknownNameError("suite", name, (*SUITE_NAMES, "all"))
+            raise UnknownNameError("suite", name, (*SUITE_NAMES, "all", *BENCHMARK_SUITES))
         tasks, variants = _SUITES[name](choice)
         if not tasks:
             raise UsageError(f"none of the chosen tasks is one that suite {name} is about")
@@ -156,7 +159,7 @@ def make_suites(names: Iterable[str], choice: Choice) -> list[Suite]:
 
 def _methods(choice: Choice, default: Sequence[str] = METHOD_NAMES) -> list[Variant]:
     if choice.base.config != "adaptive":
-        default = [method for method in default if method in PAPER_METHODS]
+        default = [method for method in default if method in (*PAPER_METHODS, REPLAY)]
     return [replace(choice.base, method=method, steps=choice.steps) for method in choice.methods or default]
 
 
@@ -180,5 +183,8 @@ _SUITES: dict[str, Callable[[Choice], tuple[Sequence[str], list[Variant]]]] = {
         [replace(choice.base, downsampling=way) for way in ("uniform", "masked")],
     ),
     "trajectories": lambda choice: (choice.tasks or ("push-cube",), _methods(choice, SAMPLING_METHODS)),
+    METAWORLD.name: lambda choice: (choice.tasks or METAWORLD.tasks, _methods(choice, BENCHMARK_METHODS)),
+    MANISKILL.name: lambda choice: (choice.tasks or MANISKILL.tasks, _methods(choice, BENCHMARK_METHODS)),
 }
-SUITE_NAMES = tuple(name for name in _SUITES if name != CHOSEN)
+BENCHMARK_SUITES = (METAWORLD.name, MANISKILL.name)
+SUITE_NAMES = tuple(name for name in _SUITES if name not in (CHOSEN, *BENCHMARK_SUITES))  # analyses of the paper

@@ -15,6 +15,7 @@ from robust_instant_policy.policies import (
     CONFIGS,
     FRAME_METHODS,
     IMAGE_METHODS,
+    METHOD_NAMES,
     REGRESSING_METHODS,
     TRAINED_METHODS,
 )
@@ -23,6 +24,8 @@ from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.regression import DEFAULT_DOF
 
 PAPER_CONFIGS = ("paper", "paper-real")  # whose rows may stand beside the paper's numbers
+REPLAY = "replay"  # no method: the demonstrator's own trajectory for the scene, thinned out and executed like a plan
+ROW_METHODS = (REPLAY, *METHOD_NAMES)
 EXACT = "em-number"  # the model of the paper's networks, fitted exactly: an estimator of the paper's configuration, too
 
 
@@ -34,11 +37,12 @@ class Variant:
     ``layout``, ``features``, ``keypoints``, ``column`` and ``estimator`` are those of `Settings`; ``config`` names
     the configuration that these make: the one of `CONFIGS` that is nearest, with what differs; it is never given;
     ``model`` names the language model; ``steps`` is how long a method is trained; ``deadline_s`` bounds the
-    sampling for one plan; ``code`` is the `code_digest` of the package, which stands for every setting that has no
-    name here; ``demonstrations`` the digest of those that were shown, which are of the set ``demo_set`` (see
-    `scenes.first_demonstration_seed`). What a method does not use is always empty (a number None), so that the same
-    work is never done, nor counted, under two names; RIP with ν = ∞ is "rip-gauss", with the estimator "mean" it is
-    "mean". Rows of versions that did not note a setting have it empty, too: unknown.
+    sampling for one plan; with ``replan`` > 0 the method looks again after so many waypoints; ``code`` is the
+    `code_digest` of the package, which stands for every setting that has no name here; ``demonstrations`` the digest of
+    those that were shown, which are of the set ``demo_set`` (see `scenes.first_demonstration_seed`). What a method does
+    not use is always empty (a number None), so that the same work is never done, nor counted, under two names; RIP with
+    ν = ∞ is "rip-gauss", with the estimator "mean" it is "mean". Rows of versions that did not note a setting have it
+    empty, too: unknown.
     """
 
     method: str
@@ -59,6 +63,7 @@ class Variant:
     column: str = "auto"
     estimator: str = "em"
     config: str = ""
+    replan: int = 0
 
     @classmethod
     def of(cls, settings: Settings, method: str = "rip", **others: Any) -> Variant:
@@ -86,8 +91,10 @@ class Variant:
             changed |= {"layout": "", "model": "", "deadline_s": None}
         if method not in FRAME_METHODS:
             changed["frames"] = ""
-        if method in IMAGE_METHODS:
+        if method in IMAGE_METHODS or method == REPLAY:
             changed |= {"keypoints": "", "column": ""}
+        if method in TRAINED_METHODS or method == REPLAY:
+            changed["replan"] = 0
         for name, value in changed.items():
             object.__setattr__(self, name, value)
         object.__setattr__(self, "config", _config(self))
@@ -116,6 +123,7 @@ class Variant:
             self.layout,
             self.estimator,
             "" if self.steps is None else f"{self.steps}steps",
+            f"replan{self.replan}" if self.replan else "",
             f"set{self.demo_set}" if self.demo_set else "",
         )
         return "-".join(word for word in words if word)
@@ -140,9 +148,13 @@ def labels(variants: Sequence[Variant]) -> list[str]:
         names = [name for name in _NAMES if len({getattr(other, name) for other in same}) > 1]
         if "config" in names:  # it says what follows from it
             names = [name for name in names if name not in _CONFIGURED or _differ_within_a_config(same, name)]
-        settings = ", ".join(f"{name} {getattr(variant, name) or 'unknown'}" for name in names)
+        settings = ", ".join(f"{name} {_told(getattr(variant, name))}" for name in names)
         told.append(f"{variant.method} ({settings})" if settings else variant.method)
     return told
+
+
+def _told(value: str | float | None) -> str:
+    return "unknown" if value in ("", None) else str(value)
 
 
 def configs(variants: Sequence[Variant]) -> list[str]:

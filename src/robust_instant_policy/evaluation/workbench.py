@@ -16,9 +16,10 @@ from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import KeypointError, ModelError, PlanningError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import FailureAnalysis, Truth, film, true_keypoints
-from robust_instant_policy.evaluation.rollout import roll_out
+from robust_instant_policy.evaluation.rollout import ScenePolicy, roll_out
+from robust_instant_policy.evaluation.scene_policies import RefusingPolicy, ReplayedDemonstrator
 from robust_instant_policy.evaluation.scenes import demonstrations_folder
-from robust_instant_policy.evaluation.variant import Scene, Variant
+from robust_instant_policy.evaluation.variant import REPLAY, Scene, Variant
 from robust_instant_policy.evaluation.work import Analysis, Outcome, Planned, SceneWork, Setup
 from robust_instant_policy.llm import LanguageModel, RecordedModel, ReplayedModel, SampleStore, connect, model_name
 from robust_instant_policy.policies import (
@@ -28,6 +29,7 @@ from robust_instant_policy.policies import (
     KeypointPolicy,
     LocatedScene,
     Plan,
+    Replanning,
     Samples,
     Settings,
     Training,
@@ -37,9 +39,10 @@ from robust_instant_policy.policies import (
 )
 from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.policies.training import TrainingReport, no_report
+from robust_instant_policy.sanity import DemonstrationError, GeometryError
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.scene_truth import SceneTruth
-from robust_instant_policy.tasks.task import Task, offers
+from robust_instant_policy.tasks.task import Task, offers, require
 from robust_instant_policy.trajectory import Trajectory
 
 if TYPE_CHECKING:  # it needs the extra "train"
@@ -68,6 +71,7 @@ class Workbench:
         self._demonstrations = demonstrations or self._read_demonstrations
         self._task: Task | None = None
         self._place = ("", "", "", "")  # task, set of objects, their source and level in the simulator
+        self._seed = 0  # of the current scene
         self._forget()
 
     def run(self, work: SceneWork) -> Iterator[Outcome]:
@@ -75,6 +79,7 @@ class Workbench:
         task = self._enter(work.scene)
         self._show(work)
         observation = task.reset(work.scene.seed)
+        self._seed = work.scene.seed
         self._located.clear()
         self._samples.clear()
         failed = list(work.failed)
@@ -87,7 +92,7 @@ class Workbench:
                     failed.append(episode)
         for variant in work.plans:
             policy = self._policy(variant)
-            if isinstance(policy, RememberingPolicy):
+            if not isinstance(policy, ClosedLoopPolicy):
                 with suppress(KeypointError, PlanningError):
                     yield Planned(work.scene, variant, policy.plan(observation))
         if self._setup.analyses:
@@ -131,7 +136,7 @@ class Workbench:
         self._shown: list[Demonstration] = []
         self._shown_truth: list[SceneTruth] = []
         self._contexts: dict[ContextKey, Context] = {}
-        self._policies: dict[Variant, RememberingPolicy | ClosedLoopPolicy] = {}
+        self._policies: dict[Variant, ScenePolicy | ClosedLoopPolicy] = {}
         self._located: dict[ContextKey, LocatedScene] = {}  # these two of the present scene
         self._samples: dict[ContextKey, Samples] = {}
 
@@ -162,6 +167,14 @@ class Workbench:
         plan, self._samples[asked] = policy.plan_from(self._located[key], self._samples.get(asked, NO_SAMPLES))
         return plan
 
+    def _demonstrate(self) -> Trajectory:
+        """What the demonstrator does in the current scene, which is built anew afterwards."""
+        assert self._task is not None
+        require(self._task, "demonstrate")
+        shown = self._task.demonstrate(self._seed).demonstration.trajectory
+        self._task.reset(self._seed)
+        return shown
+
     def _settings(self, variant: Variant) -> Settings:
         assert self._task is not None
         settings = Settings(
@@ -172,16 +185,26 @@ class Workbench:
                 settings = settings.changed(**{name: value})
         return settings if variant.dof is None else settings.changed(dof=variant.dof)
 
-    def _policy(self, variant: Variant) -> RememberingPolicy | ClosedLoopPolicy:
+    def _policy(self, variant: Variant) -> ScenePolicy | ClosedLoopPolicy:
         if variant not in self._policies:
             training = None
             if variant.steps is not None:
                 training = Training(self._setup.checkpoints, variant.steps, report=self._report)
             model = cast(LanguageModel, _Later(self))
+            if variant.method == REPLAY:
+                self._policies[variant] = ReplayedDemonstrator(self._demonstrate, variant.downsampling)
+                return self._policies[variant]
             policy = make_policy(variant.method, model, self._settings(variant), training, self._setup.deadline_s)
             if isinstance(policy, KeypointPolicy):
-                policy.fit_context(self.context(variant.demos, policy.settings))
-                self._policies[variant] = RememberingPolicy(self, policy, variant.demos)
+                try:
+                    policy.fit_context(self.context(variant.demos, policy.settings))
+                    self._policies[variant] = (
+                        Replanning(policy, variant.replan)
+                        if variant.replan
+                        else RememberingPolicy(self, policy, variant.demos)
+                    )
+                except (GeometryError, DemonstrationError, KeypointError) as error:
+                    self._policies[variant] = RefusingPolicy(error)
             else:  # in closed loop; what it has after `fit` only makes it no `ClosedLoopPolicy` for isinstance yet
                 shown = self._read_demonstrations(self._place[0], variant.demos, with_images=True)
                 self._policies[variant] = cast(ClosedLoopPolicy, policy).fit(shown)
@@ -197,8 +220,10 @@ class Workbench:
             key = demos, settings.of_context
             if key not in truths:
                 known = self._truth_of_demonstrations(demos)
-                context = self.context(demos, settings)
-                truths[key] = None if known is None else true_keypoints(task, scene.seed, context, known)
+                truths[key] = None
+                with suppress(GeometryError, DemonstrationError, KeypointError):
+                    if known is not None:
+                        truths[key] = true_keypoints(task, scene.seed, self.context(demos, settings), known)
             return truths[key]
 
         for episode in failed:

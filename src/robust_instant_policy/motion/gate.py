@@ -7,6 +7,7 @@ slows down). `judge` looks at the measured states.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,11 +28,12 @@ BLOCKED_SHARE = 0.3  # of its travel that it may lack then
 class Gate:
     """Checks commands for A arms at ``rate_hz``, and their states.
 
-    `start` must be called with measured states before the first command. All quantities that depend on time count
-    control steps, so that a change of the system's clock has no effect.
+    `start` must be called with measured states before the first command. A state is stale when its clock stands still
+    for ``stale_s`` seconds. A change of the system's time has no effect.
     """
 
-    def __init__(self, arms: Sequence[Arm], limits: Limits, rate_hz: float):
+    def __init__(self, arms: Sequence[Arm], limits: Limits, rate_hz: float, stale_s: float = STALE_S):
+        self._stale_s = stale_s
         self._arms, self._limits, self._rate = arms, limits, rate_hz
         self._space = Space(arms, limits)
         self._speed = np.array([arm.joint_speed for arm in arms])[:, None] / rate_hz
@@ -39,7 +41,8 @@ class Gate:
 
     def start(self, states: Sequence[ArmState]) -> None:
         """Take the measured joints as the last command; raises `StoppedError` if the arms are not ready."""
-        self._clocks, self._stale, self._opening = [-math.inf] * len(states), [0] * len(states), [0] * len(states)
+        now = time.monotonic()
+        self._clocks, self._fresh, self._opening = [-math.inf] * len(states), [now] * len(states), [0] * len(states)
         self._last: list[Command] = [Command(state.joints, state.finger_travel) for state in states]
         self._change = np.zeros((len(states), len(states[0].joints)))
         self.judge(states)
@@ -106,10 +109,11 @@ class Gate:
                 raise StoppedError(f"{arm.name} reports: {'; '.join(state.faults)}")
             if not (np.isfinite(state.joints).all() and np.isfinite(state.finger_travel)):
                 raise StoppedError(f"{arm.name} measures positions that are not numbers; check its cables")
-            self._stale[index] = 0 if state.clock != self._clocks[index] else self._stale[index] + 1
-            self._clocks[index] = state.clock
-            if self._stale[index] > STALE_S * self._rate:
-                raise StoppedError(f"{arm.name} sends the same state for more than {STALE_S:g} s: it is frozen")
+            now = time.monotonic()
+            if state.clock != self._clocks[index]:
+                self._clocks[index], self._fresh[index] = state.clock, now
+            if now - self._fresh[index] > self._stale_s:
+                raise StoppedError(f"{arm.name} sends the same state for more than {self._stale_s:g} s: it is frozen")
             error = np.abs(state.joints - told.joints)
             if error.max() > self._limits.following_error:
                 joint = int(np.argmax(error))

@@ -247,8 +247,9 @@ def _check_workspace(fingertips: FloatArray, arm: Arm, limits: Limits, rate_hz: 
         fingertips - np.maximum(high, home.max(axis=0)) - HOME_MARGIN_M,
     ).max(axis=(1, 2))
     inside = np.flatnonzero(outside <= ROUNDING_M)
-    first, last = (inside[0], inside[-1]) if len(inside) else (0, len(fingertips) - 1)
-    excess = np.where((np.arange(len(outside)) > first) & (np.arange(len(outside)) < last), outside, beyond)
+    excess = beyond
+    if len(inside):
+        excess[inside[0] : inside[-1]] = outside[inside[0] : inside[-1]]
     if excess.max() > ROUNDING_M:
         step = int(np.argmax(excess))
         what = "its tool is outside the workspace by"

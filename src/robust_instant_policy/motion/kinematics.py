@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robust_instant_policy.geometry import FloatArray, invert_pose
+from robust_instant_policy.geometry import FloatArray, invert_pose, make_pose
 
 MAX_ITERATIONS = 30  # per pose; two or three suffice along a path
 CONVERGED_M = 1e-4
@@ -67,6 +67,13 @@ class Kinematics:
         """Tool pose ``(4, 4)`` in the world at ``joints (J,)``."""
         self._place(joints)
         return self.base @ self._configuration.get_transform_frame_to_world(self._tool, self._kind).as_matrix()
+
+    def body_poses(self, joints: ArrayLike) -> dict[str, FloatArray]:
+        """Pose ``(4, 4)`` in the world of each body of the model, by name, at ``joints (J,)``."""
+        self._place(joints)
+        data, model = self._configuration.data, self._configuration.model
+        poses = {model.body(i).name: make_pose(data.xmat[i].reshape(3, 3), data.xpos[i]) for i in range(1, model.nbody)}
+        return {name: self.base @ pose for name, pose in poses.items()}
 
     def follow(self, poses: ArrayLike, start: ArrayLike) -> JointPath:
         """Joint angles along tool ``poses (N, 4, 4)``, each solved from the previous one, the first from ``start``."""

@@ -30,6 +30,7 @@ from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
 from robust_instant_policy.policies.neighbours import Neighbours
 from robust_instant_policy.policies.own_keypoints import KeypointSource
 from robust_instant_policy.policies.policy import ClosedLoopPolicy, Plan, Policy, Progress, Stage, Usage
+from robust_instant_policy.policies.replanning import Replanning
 from robust_instant_policy.policies.rip import RobustInstantPolicy
 from robust_instant_policy.policies.sampling import Proposal, Samples, propose, sample
 from robust_instant_policy.policies.settings import CONFIGS, Settings
@@ -55,6 +56,7 @@ __all__ = [
     "Policy",
     "Progress",
     "Proposal",
+    "Replanning",
     "RobustInstantPolicy",
     "Samples",
     "Settings",

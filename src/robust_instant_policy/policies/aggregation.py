@@ -122,6 +122,8 @@ def make_plan(
         pixels=scene.located.pixels,
         keypoint_confidence=scene.located.confidence,
         usage=Usage((scene.stage, *proposal.stages, *stages)),
+        seconds=context.pace.seconds if context.pace else None,
+        dwell=context.pace.dwell if context.pace else None,
         frames=tuple(FrameUse(*use) for use in context.prompt.for_scene(scene.keypoints).frames.uses(scene.keypoints)),
         notes=(
             *context.notes,

@@ -12,6 +12,7 @@ from robust_instant_policy.context.alignment import align
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.gripper_changes import Pace
 from robust_instant_policy.perception import CORRESPONDENCES, KeypointExtractor, Located
 from robust_instant_policy.policies.confidence import recognition
 from robust_instant_policy.policies.own_keypoints import OwnKeypoints
@@ -31,7 +32,8 @@ class Context:
     ``keypoints (I, K, 3)``, metres, world, and ``pixels (I, K, 2)`` (u, v) of the I demonstrations (no pixels, and no
     ``extractor``, where the keypoints were given); their downsampled ``trajectories``; the ``prompt`` that serialises
     both; the ``report`` of what was checked; the ``surroundings`` of the gripper; ``prediction_errors (I, S)`` in
-    metres, see `leave_one_out`; ``notes`` for the user, one line each.
+    metres, see `leave_one_out`; ``notes`` for the user, one line each; the ``pace`` of demonstrations whose rate is
+    known.
     """
 
     demonstrations: tuple[Demonstration, ...]
@@ -44,6 +46,7 @@ class Context:
     surroundings: Surroundings
     prediction_errors: FloatArray
     notes: tuple[str, ...]
+    pace: Pace | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +95,7 @@ def build_context(
         extractor=extractor,
         pixels=extractor.pixels_,
         report=report,
+        pace=Pace.of(demonstrations),
         notes=(*extractor.notes_, *report.notes, *given.notes),
     )
 

@@ -15,11 +15,13 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from robust_instant_policy.checks import checked_positive
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.files import excerpt, read_json, write_whole
 from robust_instant_policy.geometry import FloatArray, as_numbers
+from robust_instant_policy.policies.timed_poses import TimedPoses
 from robust_instant_policy.trajectory import Trajectory
 
 PLAN_FORMAT = 1  # raised when the layout of plan.json changes
@@ -103,6 +105,8 @@ class Plan:
     ``keypoints (K, 3)``, metres, world, ``pixels (K, 2)`` (u, v) and ``keypoint_confidence (K,)`` in [0, 1] are what
     was recognised; ``frames`` are those in which it was planned; ``notes`` are for the user, one line each. ``cell`` is
     the digest of the real cell it was made for, with its calibration and grippers; empty for a plan of no real cell.
+    ``seconds`` is how long the demonstrations took (their median), ``dwell`` how many seconds a gripper needs to open
+    or close; None where only trajectories were known. `poses` makes timed gripper poses of them.
     """
 
     trajectory: Trajectory
@@ -121,6 +125,37 @@ class Plan:
     evidence: Mapping[str, float] = field(default_factory=dict)
     frames: tuple[FrameUse, ...] = ()
     cell: str = ""
+    seconds: float | None = None
+    dwell: float | None = None
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Plan:
+        """A plan to follow ``trajectory``, of which nothing else is known."""
+        steps, dim = trajectory.actions.shape
+        return cls(
+            trajectory=trajectory,
+            candidates=(trajectory,),
+            weights=np.ones((1, steps)),
+            scale=np.zeros((steps, dim)),
+            hallucinated=np.zeros(1, dtype=bool),
+            onset=np.full(1, -1),
+            scores=np.zeros(1),
+            confidence=None,
+            keypoints=np.zeros((0, 3)),
+            pixels=np.zeros((0, 2)),
+            keypoint_confidence=np.zeros(0),
+        )
+
+    def poses(self, seconds: float | None = None, dwell: float | None = None) -> TimedPoses:
+        """Gripper poses to execute one after the other, with times, at the demonstrations' pace.
+
+        The motion takes ``seconds``, and stops for ``dwell`` seconds where a gripper opens or closes: there the pose
+        is repeated, with the new opening. Raises `InvalidValueError` where neither the plan nor the call says so.
+        """
+        seconds, dwell = self.seconds if seconds is None else seconds, self.dwell if dwell is None else dwell
+        if seconds is None or dwell is None:
+            raise InvalidValueError("the plan does not know how long the demonstrations took; give seconds and dwell")
+        return TimedPoses.of(self.trajectory, checked_positive("seconds", seconds), checked_positive("dwell", dwell))
 
     def save(self, path: str | Path) -> None:
         """Write the plan as JSON, whole or not at all. Raises `DatasetError` when that is not possible."""
@@ -134,6 +169,8 @@ class Plan:
             "notes": list(self.notes),
             "evidence": dict(self.evidence),
             "frames": [{**vars(frame), "pose": frame.pose.tolist()} for frame in self.frames],
+            "seconds": self.seconds,
+            "dwell": self.dwell,
             "cell": self.cell,
         }
         write_whole(Path(path), (json.dumps(content, allow_nan=False) + "\n").encode())
@@ -160,6 +197,8 @@ class Plan:
                 notes=_checked_notes(content["notes"]),
                 evidence=_checked_evidence(content.get("evidence", {})),  # plans of version 0.1 have none
                 frames=tuple(_frame(frame) for frame in content.get("frames", [])),
+                seconds=_checked_time("seconds", content.get("seconds")),
+                dwell=_checked_time("dwell", content.get("dwell")),
                 cell=str(content.get("cell", "")),
                 **{name: _array(content, name, sizes) for name in _ARRAYS},
             )
@@ -221,6 +260,10 @@ def _checked_evidence(value: object) -> dict[str, float]:
     return {name: float(number) for name, number in value.items()}
 
 
+def _checked_time(name: str, value: object) -> float | None:
+    return None if value is None else checked_positive(name, value)
+
+
 def _checked_notes(notes: object) -> tuple[str, ...]:
     if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
         raise ValueError("its notes are not a list of text")
@@ -264,7 +307,8 @@ class Policy(Protocol):
 class ClosedLoopPolicy(Protocol):
     """Sees demonstrations once, then moves the robot in closed loop."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     @property
     def max_seconds(self) -> float:

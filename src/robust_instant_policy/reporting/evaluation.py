@@ -23,6 +23,8 @@ TITLES = {
     "dof": "How many degrees of freedom ν",
     "downsampling": "Downsampling: normal or gripper-based",
     "trajectories": "A hallucinated candidate: KAT, Gaussian, RIP",
+    "metaworld": "Meta-World: fifty tasks",
+    "maniskill": "ManiSkill: tasks of the Panda",
 }
 WHISKERS = "Whiskers: Wilson's 95% interval; of the average, ± one standard deviation over tasks."
 CAPTIONS = {
@@ -32,6 +34,8 @@ CAPTIONS = {
     "queries": "RIP by the number Q of trajectories that the language model is asked for; symbols are single tasks.",
     "dof": "RIP by the degrees of freedom ν; ∞ is the Gaussian average. Symbols are single tasks.",
     "downsampling": "RIP on tasks with gripper actions. Whiskers: Wilson's 95% interval.",
+    "metaworld": "Mean success over the tasks of each group of difficulty; grey: published policies, another protocol.",
+    "maniskill": "Mean success over the tasks of each group.",
     "trajectories": "Position over time in the scene in which RIP and the Gaussian average differ most.",
 }
 TOLD = " Black lines: the paper's own numbers, with other scenes and GPT-4o; for ALOHA's tasks, of a physical robot."

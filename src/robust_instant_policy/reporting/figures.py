@@ -96,7 +96,7 @@ def _success_bars(summary: Summary) -> Figure:
     height = HEIGHT_IN * num_rows + LEGEND_ROW_IN * more_rows
     figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
     bounds = [len(groups) * row // num_rows for row in range(num_rows + 1)]
-    styles = [_style(variant) for variant in summary.variants]
+    styles = [style_of(variant) for variant in summary.variants]
     for row in range(num_rows):
         axes = figure.add_subplot(num_rows, 1, row + 1)
         _bars(axes, summary, groups[bounds[row] : bounds[row + 1]], styles, partial(_paper_percent, summary))
@@ -139,7 +139,7 @@ def _bars(
                 _paper_line(axes, place + offset, width, percent)
     room = max(8, LINE_CHARACTERS // len(groups))  # names break at their hyphens
     axes.set_xticks(range(len(groups)), [fill(group, room) for group in groups])
-    _success_axis(axes)
+    success_axis(axes)
 
 
 def _paper_percent(summary: Summary, variant: Variant, group: str) -> float | None:
@@ -177,10 +177,10 @@ def _demos(summary: Summary) -> Figure:
         shown = [of_count[count] for count in sorted(of_count)]
         # a little apart, so that methods that do equally well can be told apart
         places = [counts.index(one.demos) + 0.06 * (number - (len(groups) - 1) / 2) for one in shown]
-        _curve(axes, summary, shown, places, _style(shown[0]), label)
+        _curve(axes, summary, shown, places, style_of(shown[0]), label)
     axes.set_xticks(range(len(counts)), [str(count) for count in counts])
     axes.set_xlabel("demonstrations shown")
-    _success_axis(axes)
+    success_axis(axes)
     axes.legend(loc="lower right")
     return figure
 
@@ -197,7 +197,7 @@ def _sweep(summary: Summary, label: str, value: Callable[[Variant], str]) -> Fig
         axes.plot(*zip(*known, strict=True), marker, color="#777777", fillstyle="none", markersize=4, label=task)
     axes.set_xticks(places, values(summary.variants, value))
     axes.set_xlabel(label)
-    _success_axis(axes)
+    success_axis(axes)
     axes.legend(loc="lower right", fontsize=6.5)
     return figure
 
@@ -277,14 +277,14 @@ def _difference(robust: Plan, ablation: Plan) -> tuple[bool, float]:
     return bool(robust.hallucinated.any()), float(np.linalg.norm(points[0] - points[1], axis=1).max())
 
 
-def _success_axis(axes: Axes) -> None:
+def success_axis(axes: Axes) -> None:
     axes.set_ylim(0, 104)
     axes.set_ylabel("success [%]")
     axes.grid(axis="y", linewidth=0.3, color="#bbbbbb")
     axes.set_axisbelow(True)
 
 
-def _style(variant: Variant) -> Style:
+def style_of(variant: Variant) -> Style:
     return STYLES.get(variant.method, PLAIN)
 
 

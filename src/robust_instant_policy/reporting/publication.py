@@ -13,11 +13,15 @@ from robust_instant_policy.evaluation.suites import CHOSEN
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.files import read_regular, write_whole
 from robust_instant_policy.policies import Plan
+from robust_instant_policy.reporting.benchmark import benchmark_figure, benchmark_tables
 from robust_instant_policy.reporting.evaluation import Section, evaluation_page
 from robust_instant_policy.reporting.figures import draw, encode
 from robust_instant_policy.reporting.tables import Table, failure_table, invocation_table, tables
 from robust_instant_policy.tasks.level import make_level
+from robust_instant_policy.tasks.maniskill_benchmark.benchmark import MANISKILL
+from robust_instant_policy.tasks.metaworld.benchmark import METAWORLD
 
+BENCHMARKS = {one.name: one for one in (METAWORLD, MANISKILL)}  # suites with tables and figure of their own
 TABLE_FILE = "table.md"
 FAILURE_TABLE_FILE = "failures.md"
 RUN_TABLE_FILE = "run.md"
@@ -67,9 +71,12 @@ def _publish_suite(out: Path, config: str, split: str, summary: Summary) -> Sect
     suite = summary.suite
     usual = make_level(suite.level).objects
     kinds = tuple(kind for kind, expected in ((suite.objects, usual), (suite.assets, "code")) if kind != expected)
-    figure = draw(summary, _kept_plans(out, summary))
+    if (benchmark := BENCHMARKS.get(suite.name)) is None:
+        figure, shown = draw(summary, _kept_plans(out, summary)), tables(summary)
+    else:
+        figure, shown = benchmark_figure(benchmark, summary), benchmark_tables(benchmark, summary)
     drawing = encode(figure, "svg")
-    section = Section(suite.name, suite.level, config, kinds, drawing, tables(summary), split)
+    section = Section(suite.name, suite.level, config, kinds, drawing, shown, split)
     stem = section.anchor
     write_whole(out / f"{stem}.svg", drawing)
     write_whole(out / f"{stem}.png", encode(figure, "png"))

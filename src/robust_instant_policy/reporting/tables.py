@@ -17,8 +17,7 @@ from robust_instant_policy.evaluation.statistics import (
     mean_and_deviation,
     reference,
 )
-from robust_instant_policy.evaluation.variant import Variant, by_demos, configs, dof_symbol, labels, values
-from robust_instant_policy.policies import METHOD_NAMES
+from robust_instant_policy.evaluation.variant import ROW_METHODS, Variant, by_demos, configs, dof_symbol, labels, values
 from robust_instant_policy.reporting.comparison import is_comparable, paper_rate
 
 NONE = "–"
@@ -183,7 +182,7 @@ def failure_table(episodes: Sequence[Episode], failures: Sequence[Failure]) -> T
     known = [failure for failure in failures if failure.key in keys]
     kinds = sorted(
         {(row.variant.config, row.variant.method) for row in episodes},
-        key=lambda kind: (kind[0], METHOD_NAMES.index(kind[1])),
+        key=lambda kind: (kind[0], ROW_METHODS.index(kind[1])),
     )
     apart = len({config for config, _ in kinds if config}) > 1
     stages_met = [stage for stage in STAGES if any(failure.stage == stage for failure in known)]

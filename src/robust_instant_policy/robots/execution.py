@@ -7,6 +7,7 @@ import numpy as np
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import CellError, RobotError, StoppedError
 from robust_instant_policy.motion.guard import park_motion
+from robust_instant_policy.robots.calibration import check_camera
 from robust_instant_policy.robots.camera import Camera
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.signals import StopRequest
@@ -18,7 +19,8 @@ MIN_DEPTH_SHARE = 0.2  # of the pixels of an image; fewer, and the camera is cov
 def observe(config: CellConfig, camera: Camera) -> Observation:
     """The start image with the cell's calibration.
 
-    Raises `RobotError` for a camera that repeats its image or has no depth, `CellError` without a calibration.
+    Raises `RobotError` for a camera that repeats its image, has no depth, or is not the calibrated one, `CellError`
+    without a calibration.
     """
     if config.camera_pose is None:
         raise CellError(
@@ -27,6 +29,8 @@ def observe(config: CellConfig, camera: Camera) -> Observation:
     before, frame = camera.read(), camera.read()
     if frame.timestamp == before.timestamp:
         raise RobotError(f"camera {camera.name} repeats its image: it is frozen; unplug it, plug it in, and run again")
+    if config.camera_calibration is not None:
+        check_camera(config.camera_calibration, camera.name, frame)
     share = float((np.isfinite(frame.depth) & (frame.depth > 0)).mean())
     if share < MIN_DEPTH_SHARE:
         raise RobotError(

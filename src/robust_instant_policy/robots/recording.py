@@ -5,7 +5,6 @@ leaders ─read─▶ soft start ─▶ wanted ─▶ `Station.lead` (gate, foll
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -108,7 +107,7 @@ class _Teaching(Following):
             [[[*told.joints, travel], [*state.joints, state.finger_travel]] for told, travel, state in pairs]
         )
         self.steps.append(step)
-        self.seconds.append(time.monotonic())
+        self.seconds.append(self._station.sent_at)
         if self._logging:
             try:
                 self._journal.add(self.seconds[-1], step)

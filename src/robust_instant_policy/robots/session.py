@@ -8,23 +8,27 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count as count_from
 from pathlib import Path
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import DatasetError, StoppedError
+from robust_instant_policy.errors import DatasetError, StoppedError, UnreachableError
 from robust_instant_policy.files import read_regular, write_whole
+from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.camera import Camera
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.execution import is_parked, observe, park
 from robust_instant_policy.robots.journal import Episode, Journal
 from robust_instant_policy.robots.leader import Leader
 from robust_instant_policy.robots.operator import ENTER, Operator
-from robust_instant_policy.robots.recording import DISCARD, QUIT, demonstration_of, teach
+from robust_instant_policy.robots.recording import DISCARD, QUIT, demonstration_of, guide, teach
 from robust_instant_policy.robots.station import Station
 from robust_instant_policy.sanity import check_demonstrations
 
 PREVIEW = "p"
+OPEN = 0.9  # share of its travel from which a gripper is open
+OPENING_S = 1.0
 LATE_S = 5e-3  # deviation of a step that 95% of the steps must keep within
 
 
@@ -54,6 +58,7 @@ class Session:
         self._take_up(journal)
         while self.writer.num_episodes < count:
             self._park()
+            self._open_grippers()
             seed = None if self.next_scene is None else self.next_scene()
             start = self._start(f"demonstration {self.writer.num_episodes + 1} of {count}")
             if start is None:
@@ -95,7 +100,7 @@ class Session:
             return
         late = float(demonstration.info["jitter_95_ms"])
         timing = "" if late <= 1e3 * LATE_S else ": this computer is too busy, close other programs"
-        operator.say(f"  {demonstration.seconds:.1f} s; 95% of the steps within {late:.1f} ms of their time{timing}")
+        operator.say(f"  {demonstration.seconds:.1f} s; 95% of the steps within {late:.2f} ms of their time{timing}")
         key = operator.ask("Enter keeps it, d discards it", ENTER + DISCARD)
         while key == ENTER:
             try:
@@ -140,12 +145,38 @@ class Session:
             return
         self._store(episode, journal, None)
 
-    def _park(self) -> None:
-        if is_parked(self.station):
+    def _open_grippers(self) -> None:
+        """A demonstration begins with open grippers; the person takes what is still held."""
+        station, operator = self.station, self.operator
+        travels = [arm.finger_travel for arm in station.arms]
+        if all(state.finger_travel > OPEN * travel for state, travel in zip(station.states(), travels, strict=True)):
             return
-        played = park(self.station, self.operator.stop, self.station.config.first_run_speed)
-        if played.stopped:
-            raise StoppedError(f"{played.stopped}; the arms hold their position")
+        if operator.ask("a gripper is closed: hold what it has; Enter opens it", ENTER) != ENTER:
+            raise StoppedError(f"{operator.stop.reason}; the arms hold their position")
+        steps = count_from()
+
+        def opening(states: Sequence[ArmState]) -> list[Command] | None:
+            if next(steps) > OPENING_S * station.rate_hz or operator.stop.reason:
+                return None
+            return [Command(told.joints, travel) for told, travel in zip(station.gate.last, travels, strict=True)]
+
+        station.lead(opening)
+
+    def _park(self) -> None:
+        """Move the arms to their park poses; where the way is refused, the person leads them nearer."""
+        operator, station = self.operator, self.station
+        while not is_parked(station):
+            try:
+                played = park(station, operator.stop, station.config.first_run_speed)
+            except UnreachableError as refused:
+                operator.say(f"  {refused}")
+                words = "hold the leader near its follower's pose; Enter couples both, q ends"
+                if operator.ask(words, ENTER + QUIT) != ENTER:
+                    raise StoppedError("the arms are not parked; they hold their position") from None
+                guide(station, self.leaders, operator, "coupled: lead the arm towards its park pose; Enter lets go")
+                continue
+            if played.stopped:
+                raise StoppedError(f"{played.stopped}; the arms hold their position")
 
 
 def keep_calibration(config: CellConfig, folder: Path) -> None:

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -20,18 +21,20 @@ import numpy as np
 from robust_instant_policy.errors import RobotError, StoppedError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
-from robust_instant_policy.motion.gate import Gate
+from robust_instant_policy.motion.gate import STALE_S, Gate
 from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.follower import Follower
 from robust_instant_policy.robots.followers import make_follower
 from robust_instant_policy.robots.models import arm_of
 from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.robots.priority import CONTROL, take_real_time
 from robust_instant_policy.robots.signals import StopRequest
 
 BRAKING_STEPS = 12  # control steps in which a motion is brought to rest when somebody asks for it
 BLENDING_STEPS = 25  # in which the difference between measured joints and the first command is taken back
 START_RAD = 0.1  # largest such difference
+EMULATED_STALE_S = 0.5  # an emulation shares the processor with what uses it
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,9 @@ class Station:
         self.followers: tuple[Follower, ...] = tuple(
             make_follower(arm, one.driver, config.rate_hz) for arm, one in zip(self.arms, config.arms, strict=True)
         )
-        self.gate = Gate(self.arms, config.limits, config.rate_hz)
+        stale_s = STALE_S if config.emulation is None else EMULATED_STALE_S
+        self.sent_at = 0.0  # of the last command, seconds of a clock that does not jump
+        self.gate = Gate(self.arms, config.limits, config.rate_hz, stale_s)
 
     def __enter__(self) -> Station:
         with contextlib.ExitStack() as stack:
@@ -148,23 +153,34 @@ class Station:
     ) -> None:
         states = self.states()
         self.gate.start(states)
-        collecting = gc.isenabled()
-        gc.disable()  # a collection may take longer than a control step
         try:
-            ticker = Ticker(self.rate_hz * self.config.pace)
-            while (wanted := command(states)) is not None:
-                now = ticker.wait()
-                sent = checked(wanted)
-                for follower, one in zip(self.followers, sent, strict=True):
-                    follower.command(one)
-                states = self.states()
-                if log is not None:
-                    log.add(now, sent, states)
-                self.gate.judge(states)
+            with _undisturbed():
+                ticker = Ticker(self.rate_hz * self.config.pace)
+                while (wanted := command(states)) is not None:
+                    now = self.sent_at = ticker.wait()
+                    sent = checked(wanted)
+                    for follower, one in zip(self.followers, sent, strict=True):
+                        follower.command(one)
+                    states = self.states()
+                    if log is not None:
+                        log.add(now, sent, states)
+                    self.gate.judge(states)
         finally:
             self.stop()  # also after the last command: the servos' watchdog would not let them go on later
-            if collecting:
-                gc.enable()
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """No garbage collection, which may take longer than a control step, and a real-time priority for this thread."""
+    collecting, policy, usual = gc.isenabled(), os.sched_getscheduler(0), os.sched_getparam(0)
+    gc.disable()
+    try:
+        take_real_time(CONTROL)
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, usual)
+        if collecting:
+            gc.enable()
 
 
 class _Log:

@@ -24,7 +24,8 @@ from robust_instant_policy.sanity.geometry import (
 )
 from robust_instant_policy.sanity.view import View
 
-OWN_BETTER = 0.2  # by which the own images' consistency must exceed that of other images
+OWN_BETTER = 0.2  # by which the own images' consistency must exceed that of other images,
+ROOM = 0.5  # and less where these leave less than that to the greatest, 1: scenes of which little moves
 CLOSE_M = 0.015  # gap from which a path is compared with other hypotheses, too
 ONE_SCENE_M = 0.01  # spread of the objects below which all demonstrations show one scene
 UNLIKE = 0.25  # likeness below which a demonstration contradicts the others,
@@ -45,7 +46,7 @@ def check_contact(
     own, other = score, float("nan")
     if count > MIN_DEMONSTRATIONS and scene_spread(views) > ONE_SCENE_M:
         own, other = pairing_scores(views, poses)
-    right = as_is.is_right and not own < other + OWN_BETTER
+    right = as_is.is_right and not _fit_others(own, other)
     near = np.mean([c.path < CLOSE_M for c in as_is.contacts]) >= MIN_SHARE
     if right and (near or count <= MIN_DEMONSTRATIONS):
         return _outliers(views, as_is)
@@ -84,13 +85,18 @@ def _unexplained(views: Sequence[View], as_is: Evidence, own: float, other: floa
         return "error", f"{_measured(as_is)}; {advice}", ""
     if not as_is.touches:
         return "warning", f"{_measured(as_is)}; nothing closes there, so it was not checked further", ""
-    if own < other + OWN_BETTER:
+    if _fit_others(own, other):
         words = f"the paths fit their own images no better than each other's ({own:.2f} against {other:.2f} of 1)"
         advice = "trajectories are shuffled against images, or the images are mirrored, or of another camera"
         return "error", f"{words}; {advice}", "other images"
     score = as_is.surroundings.score
     words = f"what the images show around the gripper hardly repeats across the demonstrations ({score:.2f} of 1)"
     return "unchecked", f"{words}: whether the camera is right was not decided", ""
+
+
+def _fit_others(own: float, other: float) -> bool:
+    """Whether paths fit ``other`` images about as well as their ``own``; False where either is unknown."""
+    return own < other + OWN_BETTER * min(1.0, (1 - other) / ROOM)
 
 
 def _measured(as_is: Evidence) -> str:

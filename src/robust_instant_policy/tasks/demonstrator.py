@@ -34,10 +34,11 @@ GRIP_PAUSE_S = (0.4, 0.65)  # the demonstrator waits for the fingers
 class Stroke:
     """One movement from rest to rest through tool ``poses (N, 4, 4)``, stopping at the last.
 
-    ``error`` is the spread, in metres, of the last position; ``speed`` the typical mean speed in m/s; ``pause`` the
-    typical rest afterwards in seconds; ``closed`` the gripper state after the stroke. A ``free`` stroke touches nothing
-    and may deviate from the straight line. ``arm`` is the index of the arm among the task's end-effectors; arms move
-    at the same time, but a stroke that ``waits`` begins after all strokes listed before it.
+    ``error`` is the spread, in metres, of the last position, ``aim``, in rad, that of the rotations; ``speed`` the
+    typical mean speed in m/s; ``pause`` the typical rest afterwards in seconds; ``closed`` the gripper state after the
+    stroke. A ``free`` stroke touches nothing and may deviate from the straight line. ``arm`` is the index of the arm
+    among the task's end-effectors; arms move at the same time, but a stroke that ``waits`` begins after all strokes
+    listed before it.
     """
 
     poses: FloatArray
@@ -48,6 +49,7 @@ class Stroke:
     free: bool = False
     arm: int = 0
     waits: bool = False
+    aim: float = AIM_ERROR_RAD
 
 
 def shorter_turns(strokes: Sequence[Stroke]) -> list[Stroke]:
@@ -121,7 +123,7 @@ def _move(here: FloatArray, stroke: Stroke, pace: float, rng: np.random.Generato
     knots[1:, :3, 3] += rng.normal(0.0, stroke.error, 3)  # one error for the whole curve, not one per point
     if stroke.free:
         knots = np.insert(knots, 1, _bow(knots[0], knots[1], rng), axis=0)
-    turn = Rotation.from_rotvec(rng.normal(0.0, AIM_ERROR_RAD, 3)).as_matrix()
+    turn = Rotation.from_rotvec(rng.normal(0.0, stroke.aim, 3)).as_matrix()
     knots[1:, :3, :3] = knots[1:, :3, :3] @ turn
     rotations = Rotation.from_matrix(knots[:, :3, :3])
     step = np.linalg.norm(np.diff(knots[:, :3, 3], axis=0), axis=1)

@@ -7,6 +7,8 @@ from importlib import import_module
 from typing import Any
 
 from robust_instant_policy.errors import MissingExtraError
+from robust_instant_policy.tasks.maniskill_benchmark.benchmark import MANISKILL
+from robust_instant_policy.tasks.metaworld.benchmark import METAWORLD
 
 
 @dataclass(frozen=True)
@@ -38,4 +40,7 @@ FAMILIES = (
         ("aloha-pick-banana", "aloha-hang", "aloha-cup-upright", "aloha-sweep", "aloha-pick-place"),
     ),
 )
-BENCHMARKS: tuple[Family, ...] = ()  # tasks of other people's packages, called BENCHMARK/NAME
+BENCHMARKS = (  # tasks of other people's packages, called BENCHMARK/NAME
+    Family("metaworld.task", "metaworld", METAWORLD.tasks),
+    Family("maniskill_benchmark.task", "sim", MANISKILL.tasks),
+)

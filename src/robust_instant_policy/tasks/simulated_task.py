@@ -17,7 +17,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.waypoints import plan_onward, plan_poses, plan_waypoints
 from robust_instant_policy.tasks.demonstrator import Stroke, perform, shorter_turns
-from robust_instant_policy.tasks.level import PAPER, Layout, Level
+from robust_instant_policy.tasks.level import PAPER, Level
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, Image, bounded_seed
 from robust_instant_policy.trajectory import Trajectory
@@ -63,10 +63,9 @@ class Cell(Protocol):
     ``advance`` takes one control step towards ``command (A·(J + 1),)``: for each arm the joint angles and the finger
     travel, rad and m; ``measured`` returns the same quantities, ``grip_loads (A,)`` each gripper's share of its force
     limit. ``tool_poses`` are the arms' tool frames ``(A, 4, 4)``. ``failure`` is the reason why the task is not done,
-    empty if it is done. ``layout`` has the draws of the scene.
+    empty if it is done. ``home`` are the joint angles ``(A, J)`` at the start of the scene, of arms that start at
+    ``usual (A, J)`` unless the scene says otherwise.
     """
-
-    layout: Layout
 
     def reset(self, *, seed: int) -> Any: ...
     def photograph(self) -> Observation: ...
@@ -77,6 +76,7 @@ class Cell(Protocol):
     def tool_poses(self) -> FloatArray: ...
     def video_frame(self) -> np.ndarray: ...
     def failure(self) -> str: ...
+    def home(self, usual: FloatArray) -> FloatArray: ...
     def close(self) -> None: ...
 
 
@@ -143,13 +143,14 @@ class SimulatedTask:
         control_hz = self._timing.control_hz
         before_step = self._filming(on_frame)
         motion = Motion.at_home(self._arms)
+        rate_hz = controller.rate_hz or self.execute_hz
         steps, worst, failure = 0, 0.0, ""
         while steps < max_seconds * control_hz and not failure:
-            waypoints = controller.act(self.look().rgb, self._action(motion.closed[-1]))
+            waypoints = controller.act(self.look(), self._action(motion.closed[-1]))
             if waypoints is None:
                 break
             try:
-                motion = plan_onward(waypoints, controller.rate_hz, motion, self._arms, control_hz)
+                motion = plan_onward(waypoints, rate_hz, motion, self._arms, control_hz)
             except UnreachableError as error:
                 failure = f"refused after {steps / control_hz:.1f} s: {error}"
             else:
@@ -211,7 +212,7 @@ class SimulatedTask:
     def _rebuild(self, seed: int) -> None:
         self._cell.reset(seed=bounded_seed(seed, SEED_BITS))
         self._seed, self._fresh, self._images = seed, True, 0
-        home = self._cell.layout.home(np.stack([arm.home for arm in self._usual_arms]))
+        home = self._cell.home(np.stack([arm.home for arm in self._usual_arms]))
         self._arms = [replace(arm, home=joints) for arm, joints in zip(self._usual_arms, home, strict=True)]
 
     def look(self) -> Observation:

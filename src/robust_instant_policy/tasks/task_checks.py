@@ -211,7 +211,7 @@ class _Checks:
         replay = _Replay(attempt.demonstration)
         execution = self.called("follow", Execution, replay, 2 * attempt.demonstration.seconds + 10)
         if not replay.images:
-            self.wrong("follow", "follow() ends without calling the controller's act(image, action)")
+            self.wrong("follow", "follow() ends without calling the controller's act(observation, action)")
         elif attempt.success and not execution.success:
             self.doubt("follow", f"a demonstration that is replayed in closed loop fails ({execution.failure})")
 
@@ -253,7 +253,7 @@ class _Replay:
     def rate_hz(self) -> float:
         return self.demonstration.rate_hz
 
-    def act(self, image: NDArray[np.uint8], action: FloatArray) -> FloatArray | None:
+    def act(self, observation: Observation, action: FloatArray) -> FloatArray | None:
         self.images += 1
         return self.demonstration.trajectory.actions if self.images == 1 else None
 

@@ -4,6 +4,7 @@ If a file lacks data of a demonstration, an error lists all of it; nothing is as
 """
 
 from robust_instant_policy.datasets.importers.convert import convert_demonstrations, import_demonstrations
+from robust_instant_policy.datasets.importers.joints import JointModel
 from robust_instant_policy.datasets.importers.source import GripperCommand, Rig
 
-__all__ = ["GripperCommand", "Rig", "convert_demonstrations", "import_demonstrations"]
+__all__ = ["GripperCommand", "JointModel", "Rig", "convert_demonstrations", "import_demonstrations"]

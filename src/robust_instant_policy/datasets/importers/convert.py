@@ -77,7 +77,7 @@ def _open(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
         raise DatasetError(f"there is no {path} to import")
     if path.is_dir():
         if (path / layout.INFO_PATH).exists():
-            return read_lerobot(path, rig.camera, rig.depth_key, rig.depth_unit_m)
+            return read_lerobot(path, rig)
     else:
         with open_hdf5(path) as file:
             names = set(members(file, "/"))

@@ -1,14 +1,12 @@
-"""LeRobot v3 datasets whose frames carry end-effector poses.
+"""LeRobot v3 datasets whose frames carry end-effector poses, or joint positions and a URDF.
 
-The format does not store the camera's intrinsics and pose, the unit of depth or the meaning of gripper values,
-so the user supplies them. A pose is three axes x, y, z and either wx, wy, wz (a rotation vector, as lerobot's own
-kinematics write it: ``ee.x … ee.wz, ee.gripper_pos``) or qx, qy, qz, qw, with any prefix.
+The format does not store the camera's intrinsics and pose or the meaning of gripper values, so the user supplies them.
+Where the names of a vector's columns say what they are, see `layouts`.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,52 +18,66 @@ from numpy.typing import NDArray
 from robust_instant_policy.datasets import layout
 from robust_instant_policy.datasets.folder import Folder, open_folder
 from robust_instant_policy.datasets.images import decode_image
+from robust_instant_policy.datasets.importers.depth import PIXEL_FORMAT, dequantised, is_depth, unit_of
 from robust_instant_policy.datasets.importers.hdf5 import choose_camera
-from robust_instant_policy.datasets.importers.source import SourceEpisode, poses_of
+from robust_instant_policy.datasets.importers.layouts import (
+    Columns,
+    arm_of,
+    axis_names,
+    gripper_columns,
+    pose_columns,
+    poses_of,
+    unnamed_columns,
+)
+from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode
+from robust_instant_policy.datasets.importers.timing import even_steps, held, resampled, seconds_of
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt
 from robust_instant_policy.geometry import FloatArray, as_numbers
 
-AXIS = re.compile(r"(?:.*[._ ])?(x|y|z|wx|wy|wz|qx|qy|qz|qw)$")
-POSITION, ROTATION_VECTOR, QUATERNION = ("x", "y", "z"), ("wx", "wy", "wz"), ("qx", "qy", "qz", "qw")
-POSE_FEATURES = (
-    layout.STATE_KEY,
-    layout.ACTION_KEY,
-)  # features with poses; measured ones first, then commanded ones
+UNNAMED_POSES = {"cartesian_position": "rpy", "ee_pose": None, "eef_pose": None, "tcp_pose": None}  # and their rotation
 ADVICE = (
-    "A LeRobot dataset names the axes of a pose ee.x, ee.y, ee.z and ee.wx, ee.wy, ee.wz (rotation vector) or "
-    "ee.qx … ee.qw; depth is a feature with one number a pixel, named by depth_key= with its depth_unit_m="
+    "A LeRobot dataset names the axes of a pose ee.x, ee.y, ee.z and a rotation (ee.wx …, rx …, roll …, qx … qw), or "
+    "Rig(pose_key=, rotation=) says where it is, or Rig(joints=JointModel(urdf, link)) how to compute it; "
+    "Rig(depth_key=, depth_unit_m=) names the feature with the depth"
 )
 
 
-def read_lerobot(
-    path: Path, camera: str | None, depth_key: str | None, depth_unit_m: float | None
-) -> Iterator[SourceEpisode]:
+def read_lerobot(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
     """The episodes of a LeRobot v3 dataset."""
     folder = open_folder(path)
     if (path / layout.RIP_PATH).exists():
         raise DatasetError(f"{path} is already a demonstrations folder of rip; read it with load_demonstrations")
     features = folder.info["features"]
-    cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image") and key != depth_key]
-    chosen = choose_camera(path, cameras, camera)
-    if depth_key is not None and depth_key not in features:
-        raise DatasetError(f"{path} has no feature {depth_key!r}; it has: {excerpt(', '.join(features))}")
-    if depth_key is not None and depth_unit_m is None:
-        raise DatasetError(f"{path} does not say the unit of {depth_key!r}; give depth_unit_m=, metres a step")
+    for key in (rig.depth_key, rig.pose_key):
+        if key is not None and key not in features:
+            raise DatasetError(f"{path} has no feature {key!r}; it has: {excerpt(', '.join(features))}")
+    images = [key for key, feature in features.items() if feature["dtype"] in ("video", "image")]
+    cameras = [key for key in images if key != rig.depth_key and not is_depth(features[key])]
+    camera = choose_camera(path, cameras, rig.camera)
+    depth_key = rig.depth_key or _depth_stream(features, camera)
     for episode in range(len(folder.episodes)):
-        poses, gripper = _poses_and_gripper(folder, episode)
-        depth = None
-        if depth_key is not None and depth_unit_m is not None:
-            depth = _first_image(folder, episode, depth_key).astype(np.float32) * np.float32(depth_unit_m)
-            depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
+        poses, gripper = _poses(folder, episode, rig), _gripper(folder, episode)
+        rgb = None if camera is None else _first_image(folder, episode, camera)
+        depth = None if depth_key is None else _first_depth(folder, episode, depth_key, rig.depth_unit_m)
+        if depth is not None and rgb is not None and depth.ndim == 1 and depth.size == rgb.shape[0] * rgb.shape[1]:
+            depth = depth.reshape(rgb.shape[:2])  # stored as one row of numbers
+        name = f"{path} (episode {episode})"
+        frames = np.arange(folder.episodes[episode]["length"])
+        seconds = None if rig.rate_hz is not None else _seconds(folder, episode, name)
+        if seconds is not None:
+            times = even_steps(seconds, folder.rate_hz)
+            frames = held(seconds, times)
+            poses = None if poses is None else resampled(poses, seconds, times)
+            gripper = None if gripper is None else gripper[frames]
         yield SourceEpisode(
-            name=f"{path} (episode {episode})",
-            rgb=None if chosen is None else _first_image(folder, episode, chosen),
+            name=name,
+            rgb=rgb,
             depth=depth,
             poses=poses,
             gripper_values=gripper,
             rate_hz=folder.rate_hz,
-            images=partial(_all_images, folder, episode, chosen) if chosen in folder.video_keys else None,
+            images=partial(_images, folder, episode, camera, frames) if camera in folder.video_keys else None,
             info={
                 "source": path.name,
                 "episode": episode,
@@ -79,48 +91,104 @@ def _description(tasks: object) -> str:
     return "; ".join(str(task) for task in tasks) if isinstance(tasks, list) else ""
 
 
-def _poses_and_gripper(folder: Folder, episode: int) -> tuple[FloatArray | None, FloatArray | None]:
-    poses = gripper = None
-    for key in POSE_FEATURES:
-        if key not in folder.info["features"]:
-            continue
-        names = _axis_names(folder.info["features"][key])
-        axes = _pose_axes(names)
-        grippers = [column for column, name in enumerate(names) if "gripper" in name.lower()]
-        values = folder.matrix(episode, key)
-        if names and values.shape[1] != len(names):
-            raise DatasetError(f"{folder.root}: {key} has {values.shape[1]} numbers a frame and {len(names)} names")
-        if poses is None and axes is not None:
-            name = f"{folder.root} (episode {episode})"
-            poses = poses_of(name, values[:, axes], range(3, len(axes)))
-        if gripper is None and len(grippers) == 1:
-            gripper = values[:, grippers[0]]
-    return poses, gripper
+def _seconds(folder: Folder, episode: int, name: str) -> FloatArray | None:
+    if "timestamp" not in folder.info["features"]:
+        return None
+    return seconds_of(name, folder.matrix(episode, "timestamp")[:, 0], folder.rate_hz)
 
 
-def _axis_names(feature: Mapping[str, Any]) -> list[str]:
-    """Names of a vector's axes; datasets have a list, or lists by kind of motor."""
-    names = feature.get("names") or []
-    if isinstance(names, Mapping):
-        names = [name for group in names.values() if isinstance(group, list) for name in group]
-    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+def _vectors(folder: Folder) -> list[str]:
+    """Features that may hold a pose or a gripper: measured ones first, then commanded ones."""
+    keys = [key for key, feature in folder.info["features"].items() if feature["dtype"].startswith(("float", "int"))]
+    groups = (layout.STATE_KEY, "observation.", layout.ACTION_KEY)
+    return [key for group in groups for key in keys if next((g for g in groups if key.startswith(g)), "") == group]
 
 
-def _pose_axes(names: Sequence[str]) -> list[int] | None:
-    """Columns of x, y, z and the rotation; None if there is no pose or more than one."""
-    columns: dict[str, list[int]] = {}
-    for column, name in enumerate(names):
-        match = AXIS.match(name)
-        if match:
-            columns.setdefault(match[1], []).append(column)
-    for rotation in (ROTATION_VECTOR, QUATERNION):
-        if all(len(columns.get(axis, [])) == 1 for axis in (*POSITION, *rotation)):
-            return [columns[axis][0] for axis in (*POSITION, *rotation)]
-    return None
+def _poses(folder: Folder, episode: int, rig: Rig) -> FloatArray | None:
+    """Poses ``(T, A, 4, 4)``; None where no feature is known to hold them."""
+    where, name = [rig.pose_key] if rig.pose_key else _vectors(folder), f"{folder.root} (episode {episode})"
+    if rig.joints is not None:
+        for key in where:
+            names = axis_names(folder.info["features"][key])
+            if names:
+                return rig.joints.poses(names, _matrix(folder, episode, key, names))[:, None]
+    arms: dict[str, FloatArray] = {}
+    for key in where:
+        names = axis_names(folder.info["features"][key])
+        for columns in pose_columns(names, rig.rotation) or _unnamed(folder, key, names, rig):
+            arm = columns.arm or arm_of(key)
+            if arm not in arms:
+                values = _matrix(folder, episode, key, names)
+                arms[arm] = poses_of(name, values, columns, rig.position_unit_m, rig.tool)
+        if {"left", "right"} <= arms.keys() or "" in arms:
+            break
+    chosen = [arms[arm] for arm in ("left", "right") if arm in arms] or list(arms.values())
+    return np.stack(chosen, axis=1) if chosen else None
 
 
-def _all_images(folder: Folder, episode: int, key: str) -> NDArray[np.uint8]:
-    return np.stack(list(folder.frames(episode, key)))
+def _unnamed(folder: Folder, key: str, names: list[str], rig: Rig) -> list[Columns]:
+    """The pose in a feature that does not name its columns."""
+    last = key.replace("left_", "").replace("right_", "").rsplit(".", 1)[-1]
+    if key != rig.pose_key and last not in UNNAMED_POSES:
+        return []
+    size = int(np.prod(folder.info["features"][key]["shape"]))
+    if len({*map(str.lower, names)} & {"x", "y", "z"}) == 3:  # named, in a way that is not understood
+        return []
+    columns = unnamed_columns(size, rig.rotation or UNNAMED_POSES.get(last))
+    return [] if columns is None else [columns]
+
+
+def _gripper(folder: Folder, episode: int) -> FloatArray | None:
+    """Values of the grippers ``(T, A)``; None where no feature holds them."""
+    found: dict[str, FloatArray] = {}
+    for key in _vectors(folder):
+        names = axis_names(folder.info["features"][key])
+        columns = gripper_columns(names)
+        if not columns and "gripper" in key and folder.info["features"][key]["shape"] == [1]:
+            columns, names = {arm_of(key): 0}, []
+        for arm, column in columns.items():
+            if arm not in found:
+                found[arm] = _matrix(folder, episode, key, names)[:, column]
+        if {"left", "right"} <= found.keys() or "" in found:
+            break
+    chosen = [found[arm] for arm in ("left", "right") if arm in found] or list(found.values())
+    return np.stack(chosen, axis=1) if chosen else None
+
+
+def _matrix(folder: Folder, episode: int, key: str, names: list[str]) -> FloatArray:
+    values = folder.matrix(episode, key)
+    if names and values.shape[1] != len(names):
+        raise DatasetError(f"{folder.root}: {key} has {values.shape[1]} numbers a frame and {len(names)} names")
+    return values
+
+
+def _images(folder: Folder, episode: int, key: str, frames: NDArray[np.intp]) -> NDArray[np.uint8]:
+    return np.stack(list(folder.frames(episode, key)))[frames]
+
+
+def _depth_stream(features: Mapping[str, Any], camera: str | None) -> str | None:
+    """The depth stream of ``camera``, or the only one."""
+    streams = [key for key, feature in features.items() if is_depth(feature)]
+    own = [key for key in streams if key == f"{camera}_depth"]
+    return (own or streams)[0] if len(own or streams) == 1 else None
+
+
+def _first_depth(folder: Folder, episode: int, key: str, unit_m: float | None) -> NDArray[np.float32]:
+    """Depth ``(H, W)``, or ``(H·W,)`` where it is stored so, metres, of the first frame."""
+    feature = folder.info["features"][key]
+    if key in folder.video_keys:
+        if not is_depth(feature):
+            raise DatasetError(
+                f"{folder.root}: {key} is a colour video, which holds no depth; record depth as a depth stream of "
+                "lerobot 0.6, or as a feature with one number a pixel"
+            )
+        codes = next(folder.frames(episode, key, PIXEL_FORMAT))
+        return dequantised(codes, feature, f"{folder.root}: {key}")
+    unit = unit_m or unit_of(feature)
+    if unit is None:
+        raise DatasetError(f"{folder.root} does not say the unit of {key!r}; give depth_unit_m=, metres a step")
+    depth = _first_image(folder, episode, key).astype(np.float32) * np.float32(unit)
+    return depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
 
 
 def _first_image(folder: Folder, episode: int, key: str) -> NDArray:

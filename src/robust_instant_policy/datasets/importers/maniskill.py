@@ -22,13 +22,15 @@ from robust_instant_policy.datasets.importers.hdf5 import (
     open_hdf5,
     read,
 )
-from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode, poses_of
+from robust_instant_policy.datasets.importers.layouts import Columns, poses_of
+from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt, read_json
 from robust_instant_policy.geometry import invert_pose
 
 MILLIMETRE = 1e-3
 # ManiSkill's Panda: the last action runs from -1 (closed) to 1 (open), and its tcp is the tool frame of `geometry`.
+XYZ_WXYZ = Columns("", (0, 1, 2), (4, 5, 6, 3), "quat_xyzw")
 PANDAS = ("panda", "panda_wristcam")
 PANDA_GRIPPER = GripperCommand(open=1.0, closed=-1.0)
 ADVICE = (
@@ -77,7 +79,7 @@ def _read_episode(
         depth=None if depth is None else depth[0, ..., 0].astype(np.float32) * MILLIMETRE,
         intrinsics=intrinsics,
         camera_pose=None if extrinsics is None else invert_pose(np.vstack([extrinsics, [0, 0, 0, 1]])),
-        poses=None if tcp is None else poses_of(f"{path} ({name})", tcp, [4, 5, 6, 3]),
+        poses=None if tcp is None else poses_of(f"{path} ({name})", tcp, XYZ_WXYZ),
         tool=np.eye(4) if panda else None,
         # The command at each observation; the last observation has none, so the previous command is repeated.
         gripper_values=None if actions is None else np.append(actions[:, -1], actions[-1, -1]).astype(np.float64),

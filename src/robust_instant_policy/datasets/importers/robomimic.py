@@ -22,11 +22,13 @@ from robust_instant_policy.datasets.importers.hdf5 import (
     read,
     read_json_attribute,
 )
-from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode, poses_of
+from robust_instant_policy.datasets.importers.layouts import Columns, poses_of
+from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt
 
-ROBOSUITE = 1  # env_type of robosuite
+ROBOSUITE = 1  # type of robosuite's environments
+XYZ_XYZW = Columns("", (0, 1, 2), (3, 4, 5, 6), "quat_xyzw")
 ROBOSUITE_GRIPPER = GripperCommand(open=-1.0, closed=1.0)  # the same for all of robosuite's grippers
 TOOL_FRAMES = {"Panda": np.eye(4)}  # robots whose right_hand body already is the tool frame of `geometry`
 DEMONSTRATION = re.compile(r"demo_[0-9]{1,9}")
@@ -62,8 +64,8 @@ def _read_episode(
     if position is not None and quaternion is not None:
         if position.shape != (len(quaternion), 3) or quaternion.shape[1] != 4:
             raise DatasetError(f"{path} ({excerpt(name)}): robot0_eef_pos and _quat must be (T, 3) and (T, 4)")
-        poses = poses_of(f"{path} ({excerpt(name)})", np.hstack([position, quaternion]), [3, 4, 5, 6])
-    from_robosuite = environment.get("env_type") == ROBOSUITE
+        poses = poses_of(f"{path} ({excerpt(name)})", np.hstack([position, quaternion]), XYZ_XYZW)
+    from_robosuite = environment.get("type", environment.get("env_type")) == ROBOSUITE
     settings = nested(environment, "env_kwargs")
     robots = settings.get("robots", "")
     robot = robots[0] if isinstance(robots, list) and len(robots) == 1 else robots

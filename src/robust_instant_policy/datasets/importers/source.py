@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
+from robust_instant_policy.datasets.importers.joints import JointModel
+from robust_instant_policy.datasets.importers.layouts import ROTATIONS
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.trajectory import Trajectory
-
-MIN_QUATERNION = 1e-6  # shorter quaternions have no direction
 
 
 @dataclass(frozen=True)
@@ -29,26 +28,9 @@ class GripperCommand:
             raise InvalidValueError(f"open and closed must be two different numbers, got {self.open} and {self.closed}")
 
     def state(self, values: ArrayLike) -> FloatArray:
-        """Gripper state of ``values (T,)``: 0 nearer to open, 1 nearer to closed."""
+        """Gripper state of ``values``, of any shape: 0 nearer to open, 1 nearer to closed."""
         values = np.asarray(values, dtype=np.float64)
         return (np.abs(values - self.closed) < np.abs(values - self.open)).astype(np.float64)
-
-
-def poses_of(name: str, numbers: NDArray, rotation: Sequence[int]) -> FloatArray:
-    """Poses ``(T, 4, 4)`` of ``numbers (T, D)``: three coordinates, and the rotation in the columns ``rotation``, three
-    of a rotation vector or four of a quaternion x, y, z, w.
-
-    Raises `DatasetError` that begins with ``name`` if they are not poses.
-    """
-    if numbers.ndim != 2 or numbers.shape[1] < 3 + len(rotation) or not np.isfinite(numbers).all():
-        raise DatasetError(f"{name}: poses must be finite, (T, {3 + len(rotation)}), got {numbers.shape}")
-    turns = numbers[:, list(rotation)].astype(np.float64)
-    if len(rotation) == 4 and np.linalg.norm(turns, axis=1).min() < MIN_QUATERNION:
-        raise DatasetError(f"{name}: quaternions must have length 1, and one is 0")
-    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
-    poses[:, :3, :3] = (Rotation.from_quat if len(rotation) == 4 else Rotation.from_rotvec)(turns).as_matrix()
-    poses[:, :3, 3] = numbers[:, :3]
-    return poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +40,12 @@ class Rig:
     ``triangle`` is the gripper of the imported trajectories, that of the executing robot. ``camera`` names the camera
     of the start image. ``intrinsics (3, 3)``, ``camera_pose (4, 4)`` camera to world, OpenCV axes; ``tool (4, 4)`` the
     tool frame of `geometry` within the recorded end-effector frame; ``gripper`` the meaning of the last action or of
-    the gripper's position; ``rate_hz`` the rate of the frames. For LeRobot datasets, ``depth_key`` is the feature with
-    the depth and ``depth_unit_m`` the metres per step.
+    the gripper's position; ``rate_hz`` the rate of the frames, whatever their timestamps say.
+
+    For LeRobot datasets, ``depth_key`` is the feature with the depth and ``depth_unit_m`` the metres per step, where
+    the dataset does not say it; ``pose_key`` the one with the poses, ``rotation`` one of `layouts.ROTATIONS`, where
+    names leave it open, and ``position_unit_m`` the metres per step of positions; ``joints`` makes poses of joints.
+    Raises `InvalidValueError` for an unknown ``rotation``.
     """
 
     triangle: GripperTriangle
@@ -71,15 +57,24 @@ class Rig:
     rate_hz: float | None = None
     depth_key: str | None = None
     depth_unit_m: float | None = None
+    pose_key: str | None = None
+    rotation: str | None = None
+    position_unit_m: float = 1.0
+    joints: JointModel | None = None
+
+    def __post_init__(self) -> None:
+        if self.rotation is not None and self.rotation not in ROTATIONS:
+            raise InvalidValueError(f"rotation must be one of {', '.join(ROTATIONS)}, got {self.rotation!r}")
 
 
 @dataclass(frozen=True, eq=False)
 class SourceEpisode:
     """The data of a file about one episode; None for missing data.
 
-    ``rgb``, ``depth`` (metres), ``intrinsics``, ``camera_pose`` as in `Observation`; ``poses (T, 4, 4)`` of the
-    end effector in the world; ``tool (4, 4)``, the tool frame of `geometry` within the end effector's own;
-    ``gripper_values (T,)`` and their meaning. ``images`` returns ``(T, H, W, 3)`` uint8 of all steps.
+    ``rgb``, ``depth`` (metres), ``intrinsics``, ``camera_pose`` as in `Observation`; ``poses (T, A, 4, 4)`` of the end
+    effectors of A arms in the world; ``tool (4, 4)``, the tool frame of `geometry` within the end effector's own;
+    ``gripper_values (T, A)`` and their meaning. The arms' axis may be left out where there is one arm.
+    ``images`` returns ``(T, H, W, 3)`` uint8 of all steps.
     ``advice`` says how to obtain a file with the missing data.
     """
 
@@ -117,9 +112,10 @@ class SourceEpisode:
             or self.rate_hz is None
         ):
             raise DatasetError(f"{self.name} lacks {'; '.join(self._missing())}{self.advice and '. ' + self.advice}")
-        if len(self.poses) != len(self.gripper_values):
+        if self.poses.shape[:-2] != self.gripper_values.shape:
             raise DatasetError(
-                f"{self.name} is damaged: it has {len(self.poses)} poses and {len(self.gripper_values)} gripper values"
+                f"{self.name} is damaged: it has poses {self.poses.shape[:-2]} and gripper values "
+                f"{self.gripper_values.shape} of steps and arms"
             )
         if not np.isfinite(self.gripper_values).all():
             raise DatasetError(f"{self.name} is damaged: its gripper values are not all finite")

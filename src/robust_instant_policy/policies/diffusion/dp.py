@@ -117,10 +117,10 @@ class DiffusionController:
         self._pending: FloatArray | None = None
         self._still = 0
 
-    def act(self, image: NDArray[np.uint8], action: FloatArray) -> FloatArray | None:
+    def act(self, observation: Observation, action: FloatArray) -> FloatArray | None:
         # Recordings hold where the hand was told to be, so that is what the model is shown; it lags a little behind.
         state = action if self._commanded is None else self._commanded
-        self._seen = [*self._seen[1 - HISTORY :], self.look(small(image), state)]
+        self._seen = [*self._seen[1 - HISTORY :], self.look(small(observation.rgb), state)]
         if self._pending is not None:
             waypoints, self._pending = self._pending, None
             self._commanded = waypoints[-1]

@@ -94,17 +94,24 @@ class CameraCalibration:
             date=section.text("date"),
         )
 
-    def check(self, camera: str, frame: Frame) -> None:
-        """Raises `RobotError` where ``frame`` of the device ``camera`` is not of the calibrated camera and lens."""
-        if camera != self.camera:
-            raise RobotError(f"{self.camera} was calibrated, but {camera} is connected; run rip calibrate camera")
-        expected = self.intrinsics[:2] / np.array(self.image_size)[:, None]
-        height, width = frame.depth.shape
-        if not np.allclose(frame.intrinsics[:2] / np.array([[width], [height]]), expected, rtol=0.02, atol=0.01):
-            raise RobotError(
-                f"the intrinsics of {camera} at {width} x {height} are not those of its calibration at "
-                f"{self.image_size[0]} x {self.image_size[1]}: another crop of the image; run rip calibrate camera"
-            )
+
+def check_camera(file: Path, camera: str, frame: Frame) -> None:
+    """Raises `RobotError` where ``frame`` of the device ``camera`` is not of the camera and lens that ``file`` is of.
+
+    A file with a pose alone, written by hand, is accepted.
+    """
+    if "camera" not in read_section(file):
+        return
+    known = CameraCalibration.load(file)
+    if camera != known.camera:
+        raise RobotError(f"{known.camera} was calibrated, but {camera} is connected; run rip calibrate camera")
+    expected = known.intrinsics[:2] / np.array(known.image_size)[:, None]
+    height, width = frame.depth.shape
+    if not np.allclose(frame.intrinsics[:2] / np.array([[width], [height]]), expected, rtol=0.02, atol=0.01):
+        raise RobotError(
+            f"the intrinsics of {camera} at {width} x {height} are not those of its calibration at "
+            f"{known.image_size[0]} x {known.image_size[1]}: another crop of the image; run rip calibrate camera"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.robots.calibration.toml import toml
 
 MIN_TOUCHES = 4
-MIN_SPREAD_RAD = np.radians(15.0)  # of the directions from which the point is touched
+MIN_SPREAD_RAD = np.radians(10.0)  # of the directions from which the point is touched
 MAX_TIP_M = 0.6  # from the hand's frame; longer, it is not in metres
 OPENING_M = (0.005, 0.4)  # between open fingertips
 ALONG_Y = 0.7  # least part of the direction between the fingertips along y of the model

@@ -20,10 +20,12 @@ import numpy as np
 
 from robust_instant_policy.errors import CellError, RipError
 from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.emulation.controller import Controller
 from robust_instant_policy.robots.emulation.faults import FaultSwitch
 from robust_instant_policy.robots.emulation.servos import ServoBus
 from robust_instant_policy.robots.emulation.twin import SharedTwin, Twin
 from robust_instant_policy.robots.models import arm_of
+from robust_instant_policy.robots.priority import DEVICE, take_real_time
 
 
 class Device(Protocol):
@@ -40,11 +42,14 @@ class Device(Protocol):
 def make_device(kind: str, twin: SharedTwin, index: int, finger_travel: float) -> Device:
     if kind == "viperx":
         return ServoBus(twin, index, finger_travel)
+    if kind == "ur5e":
+        return Controller(twin, index, finger_travel)
     raise CellError(f"an arm with the driver {kind!r} cannot be emulated")
 
 
 def serve(config: CellConfig, twin: Twin) -> None:
     """Emulate the cell until standard input ends; the first line of standard output says where its devices are."""
+    take_real_time(DEVICE)
     shared = SharedTwin(twin)
     devices = {
         one.name: make_device(one.driver.kind, shared, index, arm_of(one, config.path.parent).finger_travel)

@@ -113,6 +113,10 @@ class AlohaEnv(gymnasium.Env):
         """Add the episode's objects, drawn from `draw` and placed by `Layout.place`, to ``spec``."""
         raise NotImplementedError
 
+    def home(self, usual: FloatArray) -> FloatArray:
+        """Start pose ``(A, J)`` of the episode, rad."""
+        return self.layout.home(usual)
+
     def failure(self) -> str:
         """Reason why the task is not done; empty if it is done."""
         raise NotImplementedError

@@ -19,6 +19,7 @@ from mani_skill.utils.structs.types import SimConfig
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.tasks.level import PAPER, Distractor, Layout, Level, Region
+from robust_instant_policy.tasks.maniskill.camera import photograph, scene_truth
 from robust_instant_policy.tasks.maniskill.carpentry import add_box, add_cylinder
 from robust_instant_policy.tasks.maniskill.paint import BLACK, Paint
 from robust_instant_policy.tasks.maniskill.robot import FINGER_STIFFNESS, FINGER_TRAVEL_M, GRIP_FORCE_N, UR5eHandE
@@ -184,38 +185,15 @@ class CellEnv(BaseEnv):
 
     def photograph(self) -> Observation:
         """The current image of the top-view camera."""
-        camera = self._sensors["top"]
-        self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        camera.capture()
-        images = camera.get_obs(rgb=True, depth=True, position=False, segmentation=False)
-        parameters = camera.get_params()
-        world_to_camera = parameters["extrinsic_cv"][0].cpu().numpy().astype(np.float64)
-        rotation = world_to_camera[:3, :3].T
-        intrinsics = parameters["intrinsic_cv"][0].cpu().numpy().astype(np.float64)
-        intrinsics[:2, 2] -= 0.5  # SAPIEN counts pixels from their corners, OpenCV from their centres
-        depth_mm = images["depth"][0, ..., 0].cpu().numpy()
-        return Observation(
-            rgb=images["rgb"][0].cpu().numpy().astype(np.uint8),
-            depth=depth_mm.astype(np.float32) / 1000.0,
-            intrinsics=intrinsics,
-            camera_pose=make_pose(rotation, -rotation @ world_to_camera[:3, 3]),
-        )
+        return photograph(self, "top")
 
     def scene_truth(self) -> SceneTruth:
         """Ground truth of each pixel of the top view."""
-        camera = self._sensors["top"]
-        self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        camera.capture()
-        labels = camera.get_obs(rgb=False, depth=False, position=False, segmentation=True)["segmentation"]
-        entities = {actor._objs[0].per_scene_id: actor for actor in self.scene.actors.values()}
-        for articulation in self.scene.articulations.values():
-            entities |= {link._objs[0].entity.per_scene_id: link for link in articulation.links}
-        poses = [entity.pose.to_transformation_matrix()[0].cpu().numpy() for entity in entities.values()]
-        parts = np.full((CAMERA_PIXELS, CAMERA_PIXELS), -1)
-        for index, identity in enumerate(entities):
-            parts[labels[0, ..., 0].cpu().numpy() == identity] = index
-        names = tuple(entity.name for entity in entities.values())
-        return SceneTruth(parts, names, np.array(poses, dtype=np.float64))
+        return scene_truth(self, "top")
+
+    def home(self, usual: FloatArray) -> FloatArray:
+        """Start pose ``(1, J)`` of the episode, rad."""
+        return self.layout.home(usual)
 
     def video_frame(self) -> np.ndarray:
         """RGB frame ``(H, W, 3)`` uint8 of the camera beside the table."""

@@ -1,0 +1,1 @@
+"""Robust Instant Policy for Inspect Robots: the policy `rip`, and its simulated tasks, `rip-twin`."""

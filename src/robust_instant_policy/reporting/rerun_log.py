@@ -1,0 +1,222 @@
+"""Demonstrations and plans as entities of Rerun: camera, point cloud, keypoints, candidates with weights, paths.
+
+The entities are the same for all: ``world/camera`` with ``rgb`` and ``depth``, ``world/points``, ``world/keypoints``,
+``world/candidates/Q``, ``world/plan``, ``world/measured``, ``weights/Q``, ``notes``. Steps are the timeline ``step``.
+Needs the extra `rerun`.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import MissingExtraError, RipError, UsageError
+from robust_instant_policy.files import excerpt, make_folder, require_replaceable
+from robust_instant_policy.geometry import FloatArray, lift
+from robust_instant_policy.policies.policy import Plan
+from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_FILE
+from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+LIVE = "live"  # in place of a file: a viewer, which is started where none runs
+DEFAULT_PORT = 9876  # of Rerun's viewer
+CONNECT_S = 5.0  # for a viewer to answer
+FLUSH_S = 120.0  # for a viewer to take what was logged
+MAX_POINTS = 40_000  # of a point cloud
+POINT_M, KEYPOINT_M, PATH_M, CANDIDATE_M = 0.0015, 0.008, 0.004, 0.002  # radii
+OPEN, CLOSED, MEASURED = (40, 120, 220), (220, 110, 30), (60, 160, 60)  # colours of a gripper, and of what it did
+KEPT, HALLUCINATED = (90, 90, 200), (200, 60, 60)  # colours of candidates
+
+
+@contextmanager
+def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
+    """A recording called ``name``: in the file ``where`` (.rrd), shown by a viewer (`LIVE`), or sent to the address of
+    one (``rerun+http://…``). It is complete when the block ends.
+
+    Raises `UsageError` for anything else, `MissingExtraError` without Rerun, `RipError` where no viewer answers.
+    """
+    try:
+        import rerun as rr
+    except ImportError as error:
+        raise MissingExtraError("rerun-sdk", "rerun") from error
+    recording = rr.RecordingStream("robust-instant-policy")
+    if where == LIVE:
+        recording.spawn(default_blueprint=_blueprint())
+    elif where.startswith(("rerun://", "rerun+http://", "rerun+https://")):
+        _require_viewer(where)
+        recording.connect_grpc(where, default_blueprint=_blueprint())
+    elif where.endswith(".rrd"):
+        require_replaceable(Path(where))
+        make_folder(Path(where).absolute().parent)
+        recording.save(where, default_blueprint=_blueprint())
+    else:
+        raise UsageError(f"--rerun takes a file that ends in .rrd, {LIVE!r} or the address of a viewer, not {where!r}")
+    recording.send_recording_name(name)
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    yield recording
+    try:
+        recording.flush(timeout_sec=FLUSH_S)
+    except (RuntimeError, ValueError) as error:
+        raise RipError(f"what was logged did not arrive at {where}: {excerpt(error)}; is a viewer there?") from None
+    finally:
+        recording.disconnect()
+
+
+def _require_viewer(address: str) -> None:
+    """Raises `RipError` where nothing listens at ``address``: the recording would wait for it."""
+    try:
+        place = urlsplit(address)
+        socket.create_connection((place.hostname or "", place.port or DEFAULT_PORT), CONNECT_S).close()
+    except (OSError, ValueError) as error:
+        raise RipError(f"no viewer answers at {address} ({error}); start one with: rerun --serve-grpc") from None
+
+
+def log_plan(
+    recording: rr.RecordingStream, observation: Observation, plan: Plan, measured: FloatArray | None = None
+) -> None:
+    """Log what ``plan`` saw and chose and, where it was executed, the way ``measured (N, A, 3)`` of the points between
+    the fingertips, metres, world."""
+    import rerun as rr
+
+    _log_observation(recording, observation)
+    labels = [f"{index + 1}: {confidence:.2f}" for index, confidence in enumerate(plan.keypoint_confidence)]
+    recording.log("world/keypoints", rr.Points3D(plan.keypoints, radii=KEYPOINT_M, labels=labels, show_labels=False))
+    recording.log("world/camera/rgb/keypoints", rr.Points2D(plan.pixels, radii=4, labels=labels, show_labels=False))
+    for index, candidate in enumerate(plan.candidates):
+        _log_candidate(recording, index, candidate, plan)
+    _log_path(recording, "world/plan", plan.trajectory, PATH_M)
+    _log_steps(recording, "world/plan/gripper", plan.trajectory)
+    if measured is not None:
+        strips = list(np.swapaxes(measured, 0, 1))
+        labels = ["measured"] * len(strips)
+        recording.log("world/measured", rr.LineStrips3D(strips, radii=PATH_M, colors=MEASURED, labels=labels))
+    spread = plan.scale.reshape(len(plan.trajectory), plan.trajectory.num_arms, -1)[..., :9].mean(axis=(1, 2))
+    for step, value in enumerate(spread):
+        recording.set_time("step", sequence=step)
+        recording.log("spread", rr.Scalars(float(value)))
+    recording.reset_time()
+    told = "unknown" if plan.confidence is None else f"{plan.confidence:.2f}"
+    notes = "\n".join(f"- {note}" for note in plan.notes)
+    text = f"# Confidence {told}\n\n{notes}"
+    recording.log("notes", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+
+
+def log_run(recording: rr.RecordingStream, folder: Path) -> None:
+    """Log the plan of a run folder, and what was measured. Raises `DatasetError` where it holds no run."""
+    measured = MeasuredPath.load(folder / MEASURED_FILE).measured_tools if (folder / MEASURED_FILE).exists() else None
+    log_plan(recording, Observation.load(folder / SEEN_FILE), Plan.load(folder / PLAN_FILE), measured)
+
+
+def log_demonstrations(recording: rr.RecordingStream, demonstrations: Sequence[Demonstration]) -> None:
+    """Log every demonstration at its place of the timeline ``demonstration``, with its images where it has some."""
+    import rerun as rr
+
+    for index, demonstration in enumerate(demonstrations):
+        recording.set_time("demonstration", sequence=index)
+        recording.set_time("step", sequence=0)
+        _log_observation(recording, demonstration.observation)
+        _log_path(recording, "world/plan", demonstration.trajectory, PATH_M)
+        facts = "\n".join(f"- {name}: {value}" for name, value in demonstration.info.items())
+        seed = "" if demonstration.seed is None else f", seed {demonstration.seed}"
+        text = f"# {demonstration.task} {index}{seed}\n\n{demonstration.seconds:.1f} s\n\n{facts}"
+        recording.log("notes", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        _log_steps(recording, "world/plan/gripper", demonstration.trajectory)
+        for step, image in enumerate(demonstration.frames() if demonstration.frames is not None else ()):
+            recording.set_time("step", sequence=step)
+            recording.log("world/camera/rgb", rr.Image(image).compress(jpeg_quality=80))
+
+
+def _log_observation(recording: rr.RecordingStream, observation: Observation) -> None:
+    import rerun as rr
+
+    height, width = observation.depth.shape
+    pose = observation.camera_pose
+    recording.log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+    recording.log(
+        "world/camera",
+        rr.Pinhole(image_from_camera=observation.intrinsics, width=width, height=height, image_plane_distance=0.2),
+    )
+    recording.log("world/camera/rgb", rr.Image(observation.rgb))
+    recording.log("world/camera/depth", rr.DepthImage(np.nan_to_num(observation.depth), meter=1.0))
+    points, colours = _points(observation)
+    recording.log("world/points", rr.Points3D(points, colors=colours, radii=POINT_M))
+
+
+def _points(observation: Observation) -> tuple[FloatArray, np.ndarray]:
+    """At most `MAX_POINTS` points ``(N, 3)``, world, metres, and their colours ``(N, 3)`` uint8."""
+    rows, columns = np.nonzero(observation.depth > 0)
+    every = slice(None, None, max(1, -(-len(rows) // MAX_POINTS)))
+    rows, columns = rows[every], columns[every]
+    pixels = np.column_stack([columns, rows])
+    points = lift(pixels, observation.depth[rows, columns], observation.intrinsics, observation.camera_pose)
+    return points, observation.rgb[rows, columns]
+
+
+def _log_candidate(recording: rr.RecordingStream, index: int, candidate: Trajectory, plan: Plan) -> None:
+    """A candidate's path, the fainter the lower its weight, and its weight at each step of the plan."""
+    import rerun as rr
+
+    is_ignored = bool(plan.hallucinated[index])
+    name = f"candidate {index + 1}" + (f", hallucinated from step {plan.onset[index]}" if is_ignored else "")
+    tips = _tips(candidate)
+    pieces = np.stack([tips[:-1], tips[1:]], axis=2).reshape(-1, 2, 3)  # (steps · arms, 2, 3)
+    steps = np.linspace(0, 1, max(len(tips) - 1, 1))
+    weights = np.interp(steps, plan.trajectory.times, plan.weights[index]).repeat(candidate.num_arms)
+    rgb = np.tile(HALLUCINATED if is_ignored else KEPT, (len(pieces), 1))
+    colours = np.column_stack([rgb, 40 + 215 * weights]).astype(np.uint8)
+    path = f"world/candidates/{index + 1}"
+    recording.log(path, rr.LineStrips3D(pieces, colors=colours, radii=CANDIDATE_M))
+    recording.log(f"{path}/name", rr.Points3D(tips[-1, :1], labels=name, radii=CANDIDATE_M))
+    recording.log(f"weights/{index + 1}", rr.SeriesLines(names=name, colors=rgb[:1]), static=True)
+    for step, weight in enumerate(plan.weights[index]):
+        recording.set_time("step", sequence=step)
+        recording.log(f"weights/{index + 1}", rr.Scalars(float(weight)))
+    recording.reset_time()
+
+
+def _log_path(recording: rr.RecordingStream, path: str, trajectory: Trajectory, radius: float) -> None:
+    """The way between the fingertips, in one colour where the gripper is open and in another where it is closed."""
+    import rerun as rr
+
+    tips = _tips(trajectory)
+    pieces = np.stack([tips[:-1], tips[1:]], axis=2).reshape(-1, 2, 3)
+    closed = trajectory.gripper_state[:-1].ravel() > 0.5
+    colours = np.where(closed[:, None], CLOSED, OPEN).astype(np.uint8)
+    recording.log(path, rr.LineStrips3D(pieces, colors=colours, radii=radius))
+
+
+def _log_steps(recording: rr.RecordingStream, path: str, trajectory: Trajectory) -> None:
+    """The gripper at each step: from one fingertip over the gripper point to the other one."""
+    import rerun as rr
+
+    for step, (arms, state) in enumerate(zip(trajectory.triplets, trajectory.gripper_state, strict=True)):
+        recording.set_time("step", sequence=step)
+        colours = [CLOSED if closed > 0.5 else OPEN for closed in state]
+        recording.log(path, rr.LineStrips3D(arms[:, [1, 0, 2]], colors=colours, radii=PATH_M))
+
+
+def _tips(trajectory: Trajectory) -> FloatArray:
+    """Points midway between the fingertips ``(T, A, 3)``."""
+    return trajectory.triplets[:, :, 1:].mean(axis=2)
+
+
+def _blueprint() -> Any:
+    import rerun.blueprint as rrb
+
+    space = rrb.Spatial3DView(origin="/", contents=["+ /world/**", "- /world/camera/depth"], name="scene and paths")
+    image = rrb.Spatial2DView(origin="/world/camera", contents=["+ $origin/**", "- $origin/depth"], name="camera")
+    depth = rrb.Spatial2DView(origin="/world/camera", contents=["+ $origin/depth"], name="depth")
+    weights = rrb.TimeSeriesView(origin="/weights", name="weights of the candidates")
+    notes = rrb.TextDocumentView(origin="/notes", name="notes")
+    side = rrb.Vertical(rrb.Tabs(image, depth), weights, notes)
+    return rrb.Blueprint(rrb.Horizontal(space, side, column_shares=[3, 2]), rrb.TimePanel(state="collapsed"))

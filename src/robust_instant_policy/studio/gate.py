@@ -1,0 +1,122 @@
+"""The door of the page: an address that others can reach needs a token, and no other web site may use the page.
+
+viser listens on the loopback interface only; the gate passes connections on to it. The token is the first part of the
+address' path, so that it also stands in the address of the page's websocket.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import ipaddress
+import re
+import secrets
+import socket
+import threading
+from concurrent.futures import Future
+
+from robust_instant_policy.errors import UsageError
+
+LONGEST_HEAD = 16_384  # bytes of a request before its body
+HEAD_TIMEOUT_S = 10.0
+REFUSAL = "HTTP/1.1 403 Forbidden\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n"
+
+
+class Gate:
+    """Listens on ``host`` and ``port`` and passes accepted connections on to the loopback port ``inner``.
+
+    ``address`` is what a person opens. Raises `UsageError` where the port is taken.
+    """
+
+    def __init__(self, host: str, port: int, inner: int):
+        self._host, self._inner = host, inner
+        self._token = "" if is_loopback(host) else secrets.token_urlsafe(16)
+        listening: Future[int] = Future()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run(port, listening)), daemon=True)
+        self._thread.start()
+        try:
+            self.port = listening.result()
+        except OSError as error:
+            raise UsageError(f"{host}:{port} cannot be listened on ({error.strerror}); choose another --port") from None
+        name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        self.address = f"http://{name}:{self.port}/{self._token}".rstrip("/")
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._loop.call_soon_threadsafe(self._stopped.set)
+        self._thread.join()
+
+    async def _run(self, port: int, listening: Future[int]) -> None:
+        self._loop, self._stopped = asyncio.get_running_loop(), asyncio.Event()
+        try:
+            server = await asyncio.start_server(self._serve, self._host, port)
+        except OSError as error:
+            listening.set_exception(error)
+            return
+        listening.set_result(server.sockets[0].getsockname()[1])
+        await self._stopped.wait()
+        server.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        inner: asyncio.StreamWriter | None = None
+        try:
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_TIMEOUT_S)
+            passed, reason = admit(head.decode("latin-1"), self._token, is_loopback(self._host))
+            if reason:
+                writer.write((REFUSAL + reason + "\n").encode())
+                await writer.drain()
+                return
+            answers, inner = await asyncio.open_connection("127.0.0.1", self._inner)
+            inner.write(passed.encode("latin-1"))
+            await asyncio.gather(_copy(reader, inner), _copy(answers, writer))
+        except asyncio.CancelledError:
+            return  # the gate closes; asyncio's streams would report a cancelled task as an error
+        except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            pass  # the browser went away, or is none
+        finally:
+            for end in (writer, inner):
+                if end is not None:
+                    end.close()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches ``host``."""
+    if host == "localhost":
+        return True
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return False
+
+
+def admit(head: str, token: str, loopback: bool) -> tuple[str, str]:
+    """The request ``head`` without the token in its path, and why it is refused, empty where it is not.
+
+    A page of another web site is refused by the Origin that browsers name; on the loopback interface, a Host that
+    is not this machine's is refused, too, since it may be a foreign name that resolves to this machine.
+    """
+    match = re.match(r"GET (/[^ ]*) HTTP/1\.[01]\r\n", head)
+    if match is None or len(head) > LONGEST_HEAD:
+        return "", "only a browser's requests are answered"
+    fields = {name.lower(): value for name, value in re.findall(r"^([\w-]+): *([^\r]*)", head, re.MULTILINE)}
+    host = fields.get("host", "")
+    if loopback and not is_loopback(re.sub(r":\d+$", "", host).strip("[]")):
+        return "", "this address is for this machine only"
+    if "origin" in fields and fields["origin"].split("://")[-1] != host:
+        return "", "another web site may not use this page"
+    path = match[1]
+    if token:
+        first, _, rest = path[1:].partition("?")[0].partition("/")
+        if not hmac.compare_digest(first.encode("latin-1"), token.encode()):
+            return "", "open the whole address that rip studio printed; it ends with a token"
+        path = "/" + rest
+    return head.replace(match[1], path, 1), ""
+
+
+async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    try:
+        while data := await reader.read(1 << 16):
+            writer.write(data)
+            await writer.drain()
+    finally:
+        writer.close()

@@ -1,0 +1,266 @@
+"""The page: a session's cell in 3-D, and the panel with which a person demonstrates."""
+
+from __future__ import annotations
+
+import html
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+from scipy.spatial.transform import Rotation
+
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.evaluation.scenes import stored_demonstrations
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.studio.cell import Cell
+from robust_instant_policy.studio.controls import Controls
+from robust_instant_policy.studio.plan_panel import PlanPanel
+from robust_instant_policy.studio.session import Session, Status
+from robust_instant_policy.studio.stage import Stage, place, pose_of
+
+NUDGE_M, NUDGE_RAD = 0.005, np.deg2rad(5)
+UNDO_S = 1.0
+NOTE_S = 6.0
+KEY_REPEAT_S = 0.7  # a key that is held down comes again after less than that
+MANY = 1000  # demonstrations that are read at most
+BRAND = (46, 134, 171)
+BLUE, RED, GREEN, ORANGE, GREY = "#2e6f95", "#b3262e", "#2a7d3f", "#b35c00", "#5b6470"
+WAYS = {  # key: way in the view of the browser (right, away, up), and turn about the vertical
+    "L": ((1, 0, 0), 0), "J": ((-1, 0, 0), 0), "I": ((0, 1, 0), 0), "K": ((0, -1, 0), 0),
+    "U": ((0, 0, 1), 0), "O": ((0, 0, -1), 0), "N": ((0, 0, 0), 1), "M": ((0, 0, 0), -1),
+}  # fmt: skip
+GAMEPAD = Path(__file__).with_name("gamepad.js")
+HOW_TO = """
+1. **Drag the coloured handle** at the gripper: arrows shift, rings turn. Recording begins as you move.
+2. **Space** closes and opens the gripper.
+3. Once the task is done, **Enter** keeps the demonstration; the next scene comes.
+
+**Z** goes back one second, **X** begins again. **I J K L** shift, **U O** up and down, **N M** turn.
+"""
+
+
+class Page:
+    """The page, a `session.Watcher`.
+
+    ``folder_of`` names the folder of a task's demonstrations, ``make_cell`` makes the cell of a task that was
+    demonstrated so far as it is told; ``llm`` is as in `llm.connect`.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        tasks: Sequence[str],
+        folder_of: Callable[[str], Path],
+        make_cell: Callable[[str, Sequence[Demonstration]], Cell],
+        llm: str,
+    ):
+        self.session = Session(self)
+        self.demonstrations: list[Demonstration] = []
+        self._server, self._gui = server, server.gui
+        self._folder_of, self._make_cell = folder_of, make_cell
+        self._stage, self._controls = Stage(server), Controls(server)
+        self._arm = 0  # moved by keys
+        self._gripped_at = 0.0
+        self._dragged: int | None = None
+        self._targets = np.zeros((0, 4, 4))  # at which the handles were put
+        self._grippers: tuple[str, ...] = ()
+        server.on_client_disconnect(self._forget_drag)
+        self._gui.configure_theme(
+            brand_color=BRAND, show_logo=False, show_share_button=False, control_width="medium", dark_mode=False
+        )
+        self._gui.main_panel.dock_right()
+        self._banner = self._gui.add_html("")
+        self._told = ""
+        self._task = self._gui.add_dropdown("Task", tuple(tasks))
+        self._controls.input(self._task, lambda _: self.open(self._task.value))
+        self.tabs = self._gui.add_tab_group()
+        with self.tabs.add_tab("Show", viser.Icon.HAND_MOVE):
+            self._build()
+        self.plans = PlanPanel(
+            self._gui,
+            self._stage,
+            self.tabs,
+            self.session,
+            self._controls,
+            lambda: self.demonstrations,
+            self.on_message,
+            llm,
+        )
+        self._bind_keys()
+        # Browsers run no script element that is added to a page, but the handler of an image that cannot be loaded.
+        script = html.escape(GAMEPAD.read_text())
+        self._gui.add_html(f'<img src="data:," alt="" style="display:none" onerror="{script}">')
+
+    @property
+    def folder(self) -> Path:
+        return self._folder_of(self._task.value)
+
+    def open(self, task: str) -> None:
+        """Replace the cell by that of ``task``."""
+        self._task.value = task
+        self._tell(GREY, f"Opening {task} …")
+        self.session.post(lambda: self._open(task))
+
+    def on_scene(self, cell: Cell, observation: Observation) -> None:
+        self._stage.show_cell(cell)
+        self.plans.show_scene(observation)
+        names = tuple(arm.name for arm in cell.arms)
+        if names != self._grippers:
+            self._grippers, self._arm, self._dragged = names, 0, None
+            self._count()
+            self._stage.show_grippers(names)
+            for index, gizmo in enumerate(self._stage.gizmos):
+                self._follow(gizmo, index)
+        self._targets = np.zeros((0, 4, 4))
+
+    def on_frame(self, poses: Mapping[str, FloatArray], tools: FloatArray, targets: FloatArray, status: Status) -> None:
+        self._stage.show_poses(poses)
+        self._stage.show_way(tools, targets, bool(status.refusal))
+        if self._targets.shape != targets.shape:
+            self._targets = np.zeros_like(targets)
+        for index, gizmo in enumerate(self._stage.gizmos):
+            if index != self._dragged and not np.allclose(self._targets[index], targets[index]):
+                place(gizmo, targets[index])
+                self._targets[index] = targets[index]
+        self._tell(*self._situation(status))
+
+    def on_kept(self, demonstration: Demonstration, folder: Path, count: int) -> None:
+        self.demonstrations.append(demonstration)
+        self._count()
+        self.on_message(f"Kept: demonstration {count} in {folder}", is_error=False)
+
+    def on_message(self, text: str, is_error: bool = True) -> None:
+        for client in self._server.get_clients().values():
+            client.add_notification(
+                "Not done" if is_error else "Done",
+                text,
+                auto_close_seconds=NOTE_S,
+                color="red" if is_error else "green",
+            )
+
+    def say_stopped(self) -> None:
+        """Tell every browser that the server stops."""
+        self._tell(RED, "The studio was stopped. What you kept is on the disk; start it again with: rip studio")
+        self._server.flush()
+
+    def _build(self) -> None:
+        gui, held, session = self._gui, self._controls.held, self.session
+        gui.add_markdown(HOW_TO)
+        self._kept = gui.add_markdown("")
+        gui.add_button("Keep (Enter)", icon=viser.Icon.CHECK, color="green").on_click(held(self._keep))
+        grip = gui.add_button("Close / open gripper (Space)", icon=viser.Icon.ARROWS_HORIZONTAL)
+        grip.on_click(held(lambda _: session.post(lambda: session.grip(self._arm))))
+        undo = gui.add_button("Undo (Z)", icon=viser.Icon.ARROW_BACK_UP)
+        self._back = gui.add_slider("Undo by, s", min=0.5, max=10.0, step=0.5, initial_value=UNDO_S)
+        undo.on_click(held(lambda _: session.post(lambda: session.undo(self._back.value))))
+        discard = gui.add_button("Discard, begin again (X)", icon=viser.Icon.TRASH, color="gray")
+        discard.on_click(held(lambda _: session.post(session.discard)))
+        scene = gui.add_button("Another scene", icon=viser.Icon.DICE, color="gray")
+        scene.on_click(held(lambda _: session.post(lambda: session.new_scene((session.seed or 0) + 1))))
+
+    def _bind_keys(self) -> None:
+        held, session = self._controls.held, self.session
+        actions: dict[str, tuple[str, Callable[[Any], None]]] = {
+            "space": ("Close or open the gripper", self._grip),
+            "enter": ("Keep the demonstration", self._keep),
+            "Z": ("Undo", lambda _: session.post(lambda: session.undo(self._back.value))),
+            "X": ("Discard and begin again", lambda _: session.post(session.discard)),
+            "C": ("Keys move the other arm", lambda _: self._choose_arm()),
+        }
+        for key, (way, turn) in WAYS.items():
+            actions[key] = "Turn the gripper" if turn else "Shift the gripper", partial(self._nudge, way, turn)
+        for key, (name, action) in actions.items():
+            self._gui.add_command(f"{name} ({key})", hotkey=key).on_trigger(held(action))
+
+    def _open(self, task: str) -> None:
+        folder = self._folder_of(task)
+        self.demonstrations = stored_demonstrations(folder, task, MANY) if folder.exists() else []
+        seeds = [one.seed for one in self.demonstrations if one.seed is not None]
+        self._count()
+        first = max(seeds, default=-1) + 1
+        self.session.open(lambda: self._make_cell(task, self.demonstrations), first)
+
+    def _count(self) -> None:
+        kept = len(self.demonstrations)
+        words = f"**{kept} demonstration{'' if kept == 1 else 's'} kept** in `{self.folder}` (aim: ten)"
+        if len(self._grippers) > 1:
+            words += f"\n\nKeys move the **{self._grippers[self._arm]}** gripper; **C** changes to the other."
+        self._kept.content = words
+
+    def _follow(self, gizmo: viser.TransformControlsHandle, arm: int) -> None:
+        """Let the arm follow its handle."""
+
+        def aim(event: viser.TransformControlsEvent) -> None:
+            pose = pose_of(gizmo)
+            self._dragged = None if event.phase == "end" else arm
+            self.session.post(lambda: self.session.aim(arm, pose))
+            if event.phase == "end":
+                self._targets[arm] = 0.0
+                self.session.post(self.session.release)
+
+        callback = self._controls.held(aim)
+
+        async def dragged(event: viser.TransformControlsEvent) -> None:
+            await callback(event)
+            if self._dragged is None and arm < len(self._targets):  # an onlooker's drag: put the handle back
+                self._targets[arm] = 0.0
+
+        gizmo.on_update(dragged)
+
+    async def _forget_drag(self, client: viser.ClientHandle) -> None:
+        self._dragged = None
+
+    def _keep(self, event: Any) -> None:
+        def keep() -> None:
+            self.session.keep(self.folder)
+            self.session.new_scene((self.session.seed or 0) + 1)
+
+        self.session.post(keep)
+
+    def _grip(self, event: Any) -> None:
+        now, before = time.monotonic(), self._gripped_at
+        self._gripped_at = now
+        if now - before > KEY_REPEAT_S:
+            self.session.post(lambda: self.session.grip(self._arm))
+
+    def _choose_arm(self) -> None:
+        self._arm = (self._arm + 1) % max(len(self._grippers), 1)
+        self._count()
+
+    def _nudge(self, way: tuple[int, int, int], turn: int, event: Any) -> None:
+        """Shift or turn the gripper by one step, in the directions that the browser sees."""
+        look = np.asarray(event.client.camera.look_at) - np.asarray(event.client.camera.position)
+        yaw = np.round(np.arctan2(look[1], look[0]) / (np.pi / 2)) * np.pi / 2 - np.pi / 2
+        shift = Rotation.from_euler("z", yaw).as_matrix() @ np.array(way) * NUDGE_M
+        rotation = Rotation.from_euler("z", turn * NUDGE_RAD).as_matrix()
+        self.session.post(lambda: self.session.nudge(self._arm, shift, rotation))
+
+    def _situation(self, status: Status) -> tuple[str, str]:
+        """Colour and words for what goes on."""
+        cell = self.session.cell
+        if status.refusal:
+            return ORANGE, f"Out of reach: {status.refusal}"
+        if cell is not None and not cell.arms:
+            return BLUE, f"{cell.description}: demonstrations of a folder. Choose a scene and press Plan."
+        if status.phase == "ready":
+            return BLUE, f"Your turn: {cell.description if cell else ''}. Recording begins as you move the gripper."
+        if status.phase == "recording":
+            seconds = f"● Recording, {np.floor(status.seconds * 2) / 2:.1f} s. "
+            if status.failure == "":
+                return GREEN, f"{seconds}Done: {cell.goal if cell else ''}. Press Enter to keep it."
+            return GREY, f"{seconds}Not done yet{': ' + status.failure if status.failure else ''}"
+        if status.phase == "playing":
+            return BLUE, "The arm executes the plan."
+        return GREY, "The scene was used. Begin again (X), or choose another scene."
+
+    def _tell(self, colour: str, text: str) -> None:
+        told = (
+            f'<div id="studio-banner" style="background:{colour};color:#fff;font-size:1.02em;line-height:1.35;'
+            f'padding:0.6em 0.8em;margin:0.3em 0.5em;border-radius:6px">{html.escape(text)}</div>'
+        )
+        if told != self._told:
+            self._told = self._banner.content = told

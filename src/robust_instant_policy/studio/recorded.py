@@ -1,0 +1,61 @@
+"""A folder of demonstrations without a simulator: what the camera saw stands in for the cell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import UsageError
+from robust_instant_policy.geometry import FloatArray, GripperTriangle
+from robust_instant_policy.motion.arm import Arm
+from robust_instant_policy.studio.cell import Surface
+
+
+class RecordedCell:
+    """Scenes that were photographed, without arms; see `cell.Cell`.
+
+    Scene 0 is the new ``observation``, where there is one; the others are those of ``demonstrations``.
+    """
+
+    arms: Sequence[Arm] = ()
+    movable: Sequence[str] = ()
+    goal = ""
+    control_hz = execute_hz = 1.0
+    record_every = 1
+    workspace: FloatArray | None = None
+
+    def __init__(self, name: str, demonstrations: Sequence[Demonstration], observation: Observation | None):
+        self.task = self.description = name
+        seen = [] if observation is None else [observation]
+        self._scenes = [*seen, *(one.observation for one in demonstrations)]
+        if not self._scenes:
+            raise UsageError(f"{name} holds no demonstrations; record some first")
+        self.triangle = GripperTriangle.from_triplets(
+            np.concatenate([one.trajectory.triplets.reshape(-1, 3, 3) for one in demonstrations])
+        )
+
+    def reset(self, seed: int) -> Observation:
+        return self._scenes[seed % len(self._scenes)]
+
+    def move(self, body: str, pose: FloatArray) -> Observation:
+        raise UsageError("a photographed scene cannot be changed")
+
+    def surfaces(self) -> Sequence[Surface]:
+        return ()
+
+    def poses(self) -> Mapping[str, FloatArray]:
+        return {}
+
+    def tool_poses(self) -> FloatArray:
+        return np.zeros((0, 4, 4))
+
+    def advance(self, command: FloatArray) -> None:
+        raise UsageError("a photographed scene has no arm")
+
+    def failure(self) -> str | None:
+        return None
+
+    def close(self) -> None:
+        pass

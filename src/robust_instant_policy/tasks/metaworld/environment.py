@@ -1,0 +1,171 @@
+"""One of Meta-World's environments: its scenes by seed, a depth camera, and where its hand is.
+
+The package pins an older MuJoCo, whose rows of ``eq_data`` are shorter; one method is replaced for the newer ones.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import mujoco
+import numpy as np
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+from metaworld.policies import ENV_POLICY_MAP
+from metaworld.sawyer_xyz_env import SawyerMocapBase
+
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.geometry import FloatArray, make_pose
+from robust_instant_policy.tasks.scene_truth import SceneTruth
+from robust_instant_policy.tasks.task import Image
+
+WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)  # Meta-World's own parameters
+CONTROL_HZ = 80.0
+HORIZON = 500  # control steps of an episode, Meta-World's own
+STEP_M = 0.01  # by which an action of 1 moves the mocap body
+SIDE_PX = 256
+LOOK_AT_M, DISTANCE_M = (0.0, 0.68, 0.05), 1.05  # above and behind the robot's base, which is at the origin
+ELEVATION_DEG = -50.0
+FILM_CAMERA, FILM_PX = "corner3", 320
+HIDDEN_GROUP = 5  # of the robot's shapes, which the depth camera does not see
+
+
+def _reset_mocap_welds(self: Any) -> None:
+    """`SawyerMocapBase.reset_mocap_welds` for rows of any length."""
+    for row in np.flatnonzero(self.model.eq_type == mujoco.mjtEq.mjEQ_WELD):
+        self.model.eq_data[row, : len(WELD)] = WELD
+
+
+SawyerMocapBase.reset_mocap_welds = _reset_mocap_welds
+
+
+class Environment:
+    """The task ``name``, such as "reach", with its goal in the observations of the expert."""
+
+    def __init__(self, name: str):
+        self.env = ALL_V3_ENVIRONMENTS[f"{name}-v3"]()
+        self._policy = ENV_POLICY_MAP[f"{name}-v3"]
+        self.env._set_task_called, self.env._partially_observable = True, False
+        self.env.__dict__.pop("sawyer_observation_space", None)  # computed for hidden goals
+        self.model, self.data = self.env.model, self.env.data
+        base = self.model.body("base").id
+        self.model.geom_group[self.model.body_rootid[self.model.geom_bodyid] == base] = HIDDEN_GROUP
+        self.model.site_group[self.model.body_rootid[self.model.site_bodyid] == base] = HIDDEN_GROUP
+        self._renderers: dict[int, mujoco.Renderer] = {}
+        self._seen: FloatArray = np.zeros(0)  # the expert's observation
+
+    def reset(self, seed: int) -> None:
+        """Draw the positions of objects and goal for ``seed``, as the benchmark draws them."""
+        env = self.env
+        env.seeded_rand_vec, env._freeze_rand_vec = True, False
+        env.seed(seed)
+        env.reset()
+        env._freeze_rand_vec = True  # a reset draws twice; the benchmark keeps the second
+        self._seen = env.reset()[0]
+        self._place_goals()
+        self.success, self.steps = False, 0
+        self.expert = self._policy()
+
+    def step(self, shift: FloatArray, grip: float) -> None:
+        """Move the mocap body by ``shift (3,)``, metres, at most `STEP_M` an axis, with gripper effort in [-1, 1]."""
+        action = np.append(np.clip(np.asarray(shift) / STEP_M, -1, 1), grip).astype(np.float32)
+        self._seen, _, _, _, info = self.env.step(action)
+        self.steps += 1
+        self.success = self.success or bool(info["success"])
+
+    def step_expert(self) -> None:
+        """One step of the scripted expert of the package."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it asks for more than an action can do
+            action = self.expert.get_action(self._seen)
+        self.step(action[:3] * STEP_M, float(np.clip(action[3], -1, 1)))
+
+    @property
+    def over(self) -> bool:
+        return self.steps >= HORIZON
+
+    @property
+    def hand(self) -> FloatArray:
+        """Position ``(3,)`` of the hand, metres."""
+        return self.data.body("hand").xpos.copy()
+
+    @property
+    def opening(self) -> float:
+        """Distance between the fingers, metres."""
+        return float(np.linalg.norm(self.data.body("rightclaw").xpos - self.data.body("leftclaw").xpos))
+
+    def photograph(self) -> Observation:
+        """What the depth camera sees; the robot is not drawn."""
+        renderer = self._renderer(SIDE_PX)
+        renderer.update_scene(self.data, _camera())
+        rgb = renderer.render().copy()
+        renderer.enable_depth_rendering()
+        depth = renderer.render().copy()
+        renderer.disable_depth_rendering()
+        focal = SIDE_PX / 2 / np.tan(np.deg2rad(self.model.vis.global_.fovy) / 2)
+        middle = (SIDE_PX - 1) / 2
+        intrinsics = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+        return Observation(rgb, depth.astype(np.float32), intrinsics, _camera_pose())
+
+    def scene_truth(self) -> SceneTruth:
+        """Bodies and goal sites at the pixels of the camera, and their poses."""
+        renderer = self._renderer(SIDE_PX)
+        renderer.update_scene(self.data, _camera())
+        renderer.enable_segmentation_rendering()
+        seen, kind = np.moveaxis(renderer.render(), -1, 0)
+        renderer.disable_segmentation_rendering()
+        model, data = self.model, self.data
+        parts = np.full(seen.shape, -1)
+        geoms, sites = kind == mujoco.mjtObj.mjOBJ_GEOM, kind == mujoco.mjtObj.mjOBJ_SITE
+        parts[geoms] = model.geom_bodyid[seen[geoms]]
+        parts[sites] = model.nbody + seen[sites]
+        names = [model.body(i).name for i in range(model.nbody)] + [
+            f"site {model.site(i).name}" for i in range(model.nsite)
+        ]
+        turned = np.concatenate([data.xmat, data.site_xmat]).reshape(-1, 3, 3)
+        places = np.concatenate([data.xpos, data.site_xpos])
+        return SceneTruth(
+            parts, tuple(names), np.array([make_pose(*pair) for pair in zip(turned, places, strict=True)])
+        )
+
+    def video_frame(self) -> Image:
+        """A frame of one of the benchmark's own cameras, with the robot."""
+        renderer = self._renderer(FILM_PX)
+        options = mujoco.MjvOption()
+        options.geomgroup[HIDDEN_GROUP] = 1
+        renderer.update_scene(self.data, FILM_CAMERA, options)
+        return renderer.render().copy()
+
+    def close(self) -> None:
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+        self.env.close()
+
+    def _place_goals(self) -> None:
+        """Goals without a body are sites, which the benchmark puts where they belong after every step."""
+        mujoco.mj_forward(self.model, self.data)
+        for site, place in self.env._target_site_config:
+            self.env._set_pos_site(site, place)
+
+    def _renderer(self, side: int) -> mujoco.Renderer:
+        if side not in self._renderers:
+            self._renderers[side] = mujoco.Renderer(self.model, side, side)
+        return self._renderers[side]
+
+
+def _camera() -> mujoco.MjvCamera:
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.lookat[:], camera.distance = LOOK_AT_M, DISTANCE_M
+    camera.azimuth, camera.elevation = 90.0, ELEVATION_DEG
+    return camera
+
+
+def _camera_pose() -> FloatArray:
+    """Camera to world ``(4, 4)``, OpenCV axes, of `_camera`, which looks along +y and down."""
+    down = np.deg2rad(-ELEVATION_DEG)
+    forward = np.array([0.0, np.cos(down), -np.sin(down)])
+    right = np.array([1.0, 0.0, 0.0])
+    axes = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return make_pose(axes, np.array(LOOK_AT_M) - DISTANCE_M * forward)

@@ -1,0 +1,62 @@
+"""`rip run` on the emulated UR5e: image, plan, confirmation, execution through the real drivers, page."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import pytest
+
+from robust_instant_policy import Plan
+from robust_instant_policy.cli import main
+from robust_instant_policy.reporting.run import RunRecord
+from robust_instant_policy.robots.cell import CELLS
+from robust_instant_policy.robots.path import MeasuredPath
+
+pytest.importorskip("rtde_control", reason="ur_rtde has no release for Python 3.13")
+
+
+@pytest.fixture(scope="module")
+def cell(workbench):
+    """The emulated UR5e, four times as fast as time."""
+    for name in ("emulated-ur5e.toml", "emulated-ur5e-camera.toml"):
+        shutil.copy(CELLS / name, workbench)
+    path = workbench / "emulated-ur5e.toml"
+    path.write_text(path.read_text().replace("seed = 0", "seed = 100001\npace = 4"))
+    return path
+
+
+def run(cell, *more: str) -> int:
+    return main(["run", "--robot", str(cell), "--demos", "data/push-cube", *more])
+
+
+def test_a_plan_is_made_refused_where_it_does_not_belong_and_executed_where_it_does(
+    cell, workbench, monkeypatch, capsys
+):
+    monkeypatch.chdir(workbench)
+    assert run(cell, "--dry-run", "--out", "runs/cell") == 0
+    folder = workbench / "runs/cell"
+    assert RunRecord.load(folder).outcome == "planned, not executed"
+    assert not (folder / "measured.npz").exists()
+
+    plan = Plan.load(folder / "plan.json")
+    for changed, words in (
+        (replace(plan, cell="0123456789abcdef"), "made for another calibration, gripper or cell"),
+        (replace(plan, confidence=0.3), "confidence is 0.30, the limit is 0.90 (min_confidence in"),
+    ):
+        changed.save(folder / "plan.json")
+        assert run(cell, "--yes", "--plan", str(folder)) == 1
+        assert words in capsys.readouterr().err
+        assert not (folder / "measured.npz").exists()
+
+    plan.save(folder / "plan.json")
+    assert run(cell, "--plan", str(folder)) == 2  # nobody is there to be asked
+    assert "use --yes" in capsys.readouterr().err
+    assert run(cell, "--yes", "--speed", "1", "--plan", str(folder)) == 0
+    record = RunRecord.load(folder)
+    assert record.success, record.outcome
+    path = MeasuredPath.load(folder / "measured.npz")
+    assert path.tool_errors[-1].max() < 5e-3
+    page = (folder / "report.html").read_text()
+    assert "Execution: commanded and measured" in page
+    assert record.outcome in page
