@@ -168,7 +168,7 @@ def tasks_in_turn(page: Page) -> list[float]:
     seconds = []
     for name in (*TASK_NAMES[1:TASKS_IN_TURN], TASK_NAMES[0]):
         start, before = time.monotonic(), page.inner_text("#studio-banner")
-        tasks = page.locator("input.mantine-Select-input").first
+        tasks = page.locator("input.mantine-Select-input:visible").first
         tasks.fill(name)
         page.keyboard.press("ArrowDown")
         page.keyboard.press("Enter")
