@@ -3,7 +3,7 @@ SHELL := /bin/bash
 RIP := .venv/bin/rip
 WORKERS := 2
 
-.PHONY: setup demo studio test lint clean
+.PHONY: setup demo studio test lint lerobot clean
 
 setup:
 	@scripts/setup.sh
@@ -31,6 +31,13 @@ test: setup
 	@$(MAKE) --no-print-directory lint
 	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --cov --cov-report= $(ARGS)
 	@.venv/bin/python scripts/coverage_table.py
+
+# The LeRobot plugins, in an environment of their own (6 GB): the commands of docs/lerobot.md as they stand there, and tests.
+LEROBOT := .venv-lerobot
+lerobot: setup
+	plugins/setup.sh $(LEROBOT)
+	MUJOCO_GL=egl $(LEROBOT)/bin/python -m pytest -p no:cacheprovider tests/test_lerobot_plugin.py
+	.venv/bin/python scripts/lerobot_end_to_end.py --lerobot $(LEROBOT)
 
 clean:
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage .coverage.*

@@ -130,6 +130,33 @@ def test_recording_in_one_go_or_in_two_leaves_identical_folders(tmp_path):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
 
 
+def test_other_programs_find_robot_calibration_card_and_measured_gripper(tmp_path):
+    shown = demonstration(4, steps=30)
+    measured = shown.trajectory.gripper_state * 0.6
+    with DatasetWriter(tmp_path / "d", TASK, DESCRIPTION, RATE_HZ, robot_type="ur5e_hande") as writer:
+        writer.add(shown, grippers=measured)
+        assert "must be (30, 1)" in refusal(writer.add, shown, grippers=measured[:5])
+    with writer_of(tmp_path / "d") as writer:  # goes on with the same robot
+        writer.add(shown)
+    info = json.loads((tmp_path / "d/meta/info.json").read_text())
+    assert info["robot_type"] == "ur5e_hande"
+    card = (tmp_path / "d/README.md").read_text()
+    assert card.startswith("---\n")
+    assert "2 demonstrations, 60 steps" in card
+    (camera,) = json.loads((tmp_path / "d/meta/calibration.json").read_text()).values()
+    assert camera["intrinsics"]["fx"] == shown.observation.intrinsics[0, 0]
+    assert camera["extrinsics"] == shown.observation.camera_pose.ravel().tolist()
+    table = pq.read_table(tmp_path / "d/data/chunk-000/file-000.parquet")
+    state, action = (np.array(table[key].to_pylist()) for key in ("observation.state", "action"))
+    np.testing.assert_allclose(state[:, 9], measured[:, 0], atol=1e-6)
+    np.testing.assert_array_equal(state[:, :9], action[:, :9])
+    moved = shown.observation.camera_pose.copy()
+    moved[0, 3] += 0.01
+    with writer_of(tmp_path / "d") as writer:
+        writer.add(replace(shown, observation=replace(shown.observation, camera_pose=moved)))
+    assert not (tmp_path / "d/meta/calibration.json").exists()  # no one calibration is right for all
+
+
 def test_a_folder_that_was_recorded_anew_is_read_anew(tmp_path):
     for seed in (1, 2):
         shutil.rmtree(tmp_path / "d", ignore_errors=True)

@@ -14,7 +14,10 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 TARGETS = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-OTHER_PROGRAMS = {"git", "cd", "pip", "export", "vllm", "ollama", "llama-server", "docker", "sglang", "lms", "ray"}
+OTHER_PROGRAMS = {
+    "git", "cd", "pip", "export", "vllm", "ollama", "llama-server", "docker", "sglang", "lms", "ray",
+    "setup.sh", "lerobot-record", "lerobot-rollout", "lerobot-eval",
+}  # fmt: skip
 
 
 def blocks(page: Path, *languages: str) -> list[str]:

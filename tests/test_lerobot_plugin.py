@@ -10,8 +10,9 @@ import pytest
 
 from robust_instant_policy import load_demonstrations
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import PlanningError, UsageError
+from robust_instant_policy.errors import PlanningError, UnreachableError, UsageError
 from robust_instant_policy.geometry import GripperTriangle, make_pose
+from robust_instant_policy.motion.limits import Limits
 from robust_instant_policy.policies import Neighbours
 from robust_instant_policy.tasks import make_task
 
@@ -19,6 +20,7 @@ PLUGIN = Path(__file__).parents[1] / "plugins/lerobot_policy_rip/lerobot_policy_
 URDF = Path(__file__).parents[1] / "src/robust_instant_policy/motion/urdf/ur5e_hande.urdf"
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
 DOWN = np.diag([1.0, -1.0, -1.0])
+HOME = [51.6, -108.9, 126.1, -107.1, -90.0, -38.4, 100.0]
 TRIANGLE = GripperTriangle(length=0.1, opening=0.08)
 TRIPLETS = TRIANGLE.triplets(np.eye(4)[None])
 
@@ -36,16 +38,19 @@ from lerobot_policy_rip.planner import Calibration, Planner  # noqa: E402
 in_lerobot = pytest.mark.skipif(lerobot is None, reason="lerobot has an environment of its own: make lerobot")
 
 
+def triplets_of(demonstrations) -> np.ndarray:
+    return np.concatenate([shown.trajectory.triplets for shown in demonstrations])
+
+
 @pytest.fixture(scope="module")
 def planner(workbench):
     demonstrations = load_demonstrations(workbench / "data/push-cube")
     policy = Neighbours().fit(demonstrations)
-    triplets = np.concatenate([shown.trajectory.triplets for shown in demonstrations])
-    embodiment = Embodiment(simulated_arms(["hand-e"]), triplets)
+    embodiment = Embodiment(simulated_arms(["hand-e"]), triplets_of(demonstrations))
 
-    def make(min_confidence: float) -> Planner:
+    def make(min_confidence: float, limits: Limits | None = None, robot: Embodiment = embodiment) -> Planner:
         camera = Calibration.of(demonstrations, None, None)
-        return Planner(policy, embodiment, camera, min_confidence, rate_hz=55.0, waypoint_hz=5.5)
+        return Planner(policy, robot, camera, min_confidence, rate_hz=55.0, waypoint_hz=5.5, limits=limits)
 
     return make
 
@@ -132,9 +137,21 @@ def test_a_plan_begins_at_the_measured_state_and_does_the_task(planner):
 
 def test_a_plan_below_the_confidence_threshold_is_refused_with_its_reason(planner, workbench):
     seen = Observation.load(workbench / "observation.npz")
-    state = [51.6, -108.9, 126.1, -107.1, -90.0, -38.4, 100.0]
     with pytest.raises(PlanningError, match=r"is refused: confidence .*, needed 1\.01"):
-        planner(1.01).plan(seen.rgb, seen.depth, state)
+        planner(1.01).plan(seen.rgb, seen.depth, HOME)
+
+
+def test_a_real_arm_moves_within_its_workspace_or_not_at_all(planner, workbench):
+    seen = Observation.load(workbench / "observation.npz")
+    base = make_pose(np.eye(3), (-0.5, 0, 0)).tolist()
+    config = ArmConfig(str(URDF), joints=JOINTS, tool="tool", base=base, tool_speed=0.5)
+    robot = Embodiment([config], triplets_of(load_demonstrations(workbench / "data/push-cube")))
+    corners = np.array([[-0.34, -0.4, -0.005], [0.46, 0.4, 0.4]])
+    actions = planner(0.01, Limits(corners), robot).plan(seen.rgb, seen.depth, HOME)
+    assert np.abs(np.diff(actions[:, :6], axis=0)).max() * 55 < np.rad2deg(1.0) * 1.03  # the configured joint speed
+    corners[1, 0] = -0.3
+    with pytest.raises(UnreachableError, match="workspace"):
+        planner(0.01, Limits(corners), robot).plan(seen.rgb, seen.depth, HOME)
 
 
 def test_a_camera_that_moved_between_demonstrations_must_be_given(workbench):
@@ -170,7 +187,7 @@ def test_a_policys_folder_is_what_lerobot_opens(workbench, tmp_path, monkeypatch
     policy = get_policy_class("rip").from_pretrained(folder, config=config)
     before, after = make_pre_post_processors(config, pretrained_path=str(folder))
     seen = Observation.load(workbench / "observation.npz")
-    state = torch.tensor([51.6, -108.9, 126.1, -107.1, -90.0, -38.4, 100.0])
+    state = torch.tensor(HOME)
     batch = {
         "observation.images.top": torch.from_numpy(seen.rgb.copy()).permute(2, 0, 1) / 255,
         "observation.images.top_depth": torch.from_numpy(np.rint(seen.depth[None] * 1000).astype(np.uint16)),
@@ -189,3 +206,50 @@ def test_folder_without_demonstrations_is_one_line(tmp_path, monkeypatch, capsys
     monkeypatch.setattr(sys, "argv", ["x", "--demonstrations=/nowhere", "--arms=[]", f"--out={tmp_path / 'policy'}"])
     assert main() == 1 + 1
     assert "there is no folder '/nowhere'" in capsys.readouterr().err
+
+
+@in_lerobot
+def test_the_depth_camera_is_one_of_lerobots_and_its_depth_is_aligned():
+    pytest.importorskip("pyrealsense2")
+    from lerobot_robot_rip import RipRealSense, RipRealSenseConfig
+
+    from tests.test_robots_cameras import INTRINSICS, SoftwareDevice, grey
+
+    device = SoftwareDevice(grey)
+    camera = RipRealSense(RipRealSenseConfig(), device.device)
+    try:
+        camera.connect()
+        assert camera.use_depth  # LeRobot's arms then record NAME_depth, too
+        first, depth = camera.read_latest(), camera.read_latest_depth()
+        assert first.shape == (480, 640, 3)
+        assert (depth.shape, depth.dtype) == ((480, 640, 1), np.uint16)
+        assert np.median(depth) == pytest.approx(800, abs=1)
+        assert camera.intrinsics == pytest.approx(INTRINSICS)
+        assert (camera.async_read() != first).any()
+    finally:
+        camera.disconnect()
+        device.stop()
+
+
+@in_lerobot
+def test_the_leader_demonstrates_brings_the_arms_home_and_lays_out_the_next_scene(capsys):
+    from lerobot_robot_rip import RipTwin, RipTwinConfig, RipTwinLeader, RipTwinLeaderConfig
+
+    robot, leader = RipTwin(RipTwinConfig(id="test")), RipTwinLeader(RipTwinLeaderConfig(id="test", pause_s=0.4))
+    leader.connect()
+    robot.connect()
+    try:
+        said, steps = "", 0
+        while "next scene" not in said:
+            action = leader.get_action()
+            assert action.keys() == robot.action_features.keys()
+            robot.send_action(action)
+            said, steps = said + capsys.readouterr().out, steps + 1
+        assert "scene 0: done" in said
+        assert robot.seed == 1
+        assert 30 < steps < 100
+        seen = robot.get_observation()
+        assert seen.keys() == robot.observation_features.keys()
+        assert 500 < np.median(seen["top_depth"]) < 1000
+    finally:
+        robot.disconnect()

@@ -11,7 +11,7 @@ from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.simulated_task import SimulatedTask
 
 HOLD_SECONDS = 3.0  # of equal commands, after which the episode is over; waypoints are at most 1 s apart
-VIDEO_EVERY = 5  # steps; the frame is repeated between them, because rendering takes most of the time
+VIDEO_SECONDS = {True: 0.1, False: 0.5}  # between new frames of a video, with live images and without
 
 
 class RipEnv(gymnasium.Env):
@@ -32,6 +32,7 @@ class RipEnv(gymnasium.Env):
         self._max_episode_steps = round(max_seconds * self._task.control_hz)
         arms = self._task.arms
         self._embodiment = Embodiment.simulated(self._task.end_effectors, [arm.triangle for arm in arms])
+        self._frame_steps = round(VIDEO_SECONDS[live_images] * self._task.control_hz)
         self._seed = 0
         size = self._task.reset(self._seed).rgb.shape[:2]
         unbounded = Box(-np.inf, np.inf, (len(self._embodiment.axes),), np.float64)
@@ -66,7 +67,7 @@ class RipEnv(gymnasium.Env):
         return self._observe(), float(success), terminated, truncated, {"is_success": success}
 
     def render(self) -> np.ndarray:
-        if self._frame is None or self._steps % VIDEO_EVERY == 0:
+        if self._frame is None or self._steps % self._frame_steps == 0:
             self._frame = self._task.cell.video_frame()
         return self._frame
 

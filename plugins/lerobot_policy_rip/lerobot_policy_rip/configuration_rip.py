@@ -15,11 +15,12 @@ class RipConfig(PreTrainedConfig):
     """What a plan depends on, beside the scene.
 
     ``demonstrations`` is a folder of rip, or the id of a dataset on the Hub that is one. ``arms`` is the robot,
-    ``camera`` the name of its depth camera, whose depth is ``CAMERA_depth`` in steps of ``depth_unit_m``; ``intrinsics
-    (3, 3)`` and ``camera_pose (4, 4)``, camera to world, are those of the demonstrations unless given. ``llm`` is a
-    language model as ``rip --llm`` takes it, ``configuration`` "adaptive" or "paper"; ``workspace (2, 3)`` bounds what
-    is recognised, metres. Plans with a confidence below ``min_confidence`` are not executed. ``rate_hz`` must be the
-    rate at which LeRobot runs the robot; ``waypoint_hz`` sets the speed.
+    ``camera`` the name of its depth camera, whose depth is ``CAMERA_depth`` in steps of ``depth_unit_m``;
+    ``intrinsics (3, 3)`` and ``camera_pose (4, 4)``, camera to world, are those of the demonstrations unless given.
+    ``llm`` is a language model as ``rip --llm`` takes it, ``configuration`` "adaptive" or "paper"; ``workspace (2,
+    3)`` bounds what is recognised and where a real arm moves, metres. Plans with a confidence below
+    ``min_confidence`` are not executed. ``rate_hz`` must be the rate at which LeRobot runs the robot;
+    ``waypoint_hz`` sets the speed.
     """
 
     device: str | None = "cpu"  # nothing of it runs elsewhere

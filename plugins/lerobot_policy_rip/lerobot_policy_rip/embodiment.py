@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -17,12 +18,15 @@ from scipy.spatial.transform import Rotation
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle, invert_pose, make_pose
 from robust_instant_policy.motion.arm import Arm
-from robust_instant_policy.motion.kinematics import JointPath, Kinematics
+from robust_instant_policy.motion.kinematics import ORIENTATION_COST, JointPath, Kinematics
 
 POSE_AXES = ("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz")
 VIPERX_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
 UR5E_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 SIMULATED = {"viperx-left": VIPERX_JOINTS, "viperx-right": VIPERX_JOINTS, "ur5e-hande": UR5E_JOINTS}
+DEGREES_OF_FREEDOM = 6  # of a pose
+ORIENTATION_COST_FEW_JOINTS = 0.01  # metres per radian: an arm with fewer joints reaches positions first
+MESHES = (".stl", ".obj", ".msh")  # that MuJoCo reads
 MIN_MASS = 1e-3  # kg, and kg m², of a link without inertia in a file: kinematics needs none
 
 
@@ -36,8 +40,8 @@ class ArmConfig:
     commanded pose, the tool frame: z out of the gripper, y along the line on which the fingers open, origin between
     the fingertips. ``base (4, 4)`` is the pose of the arm's base in the world of the demonstrations. ``degrees`` is the
     unit of joints; ``gripper_open`` and ``gripper_closed`` are readings of the gripper.
-    Limits: ``joint_speed`` rad/s, ``tool_speed`` m/s, ``finger_speed`` m/s; ``turn_tolerance`` rad is the largest
-    accepted orientation error, larger for arms with less than six joints.
+    Limits: ``joint_speed`` rad/s, ``joint_acceleration`` rad/s², ``tool_speed`` and ``finger_speed`` m/s;
+    ``turn_tolerance`` rad is the largest accepted orientation error, larger for arms with less than six joints.
     """
 
     model: str = ""
@@ -50,6 +54,7 @@ class ArmConfig:
     gripper_open: float = 100.0
     gripper_closed: float = 0.0
     joint_speed: float = 1.0
+    joint_acceleration: float = 15.0
     tool_speed: float = 0.25
     finger_speed: float = 0.05
     turn_tolerance: float = 0.05
@@ -152,6 +157,7 @@ def _make_arm(config: ArmConfig, triplets: FloatArray) -> Arm:
         joint_speed=config.joint_speed,
         tool_speed=config.tool_speed,
         turn_tolerance=config.turn_tolerance,
+        joint_acceleration=config.joint_acceleration,
     )
 
 
@@ -166,13 +172,17 @@ def _simulated_arm(model: str) -> Arm:
 
 
 def _load_kinematics(config: ArmConfig, base: FloatArray, offset: FloatArray) -> Kinematics:
-    """Kinematics of a URDF or MJCF file, whose meshes are not read."""
+    """Kinematics of a URDF or MJCF file. Links have no shape where MuJoCo cannot read their mesh."""
     try:
         spec = mujoco.MjSpec.from_file(config.model)
         spec.compiler.fusestatic = False  # the tool may be a link without a joint
         spec.compiler.boundmass = spec.compiler.boundinertia = MIN_MASS
-        for thing in (*spec.geoms, *spec.meshes):
-            spec.delete(thing)
+        folder = Path(config.model).parent / spec.compiler.meshdir
+        for mesh in spec.meshes:
+            if Path(mesh.file).suffix.lower() not in MESHES or not (folder / mesh.file).exists():
+                for geom in [geom for geom in spec.geoms if geom.meshname == mesh.name]:
+                    spec.delete(geom)
+                spec.delete(mesh)
         links = {body.name: body for body in spec.bodies}
         if config.tool not in links:
             raise UsageError(f"{config.model} has no link {config.tool!r}; it has {', '.join(links)}")
@@ -185,4 +195,5 @@ def _load_kinematics(config: ArmConfig, base: FloatArray, offset: FloatArray) ->
     names = [model.joint(index).name for index in range(model.njnt)]
     if not config.joints or names[: len(config.joints)] != list(config.joints):
         raise UsageError(f"joints must be the first joints of {config.model}: {', '.join(names)}; got {config.joints}")
-    return Kinematics(model, "rip-tool", "site", len(config.joints), base)
+    cost = ORIENTATION_COST if len(config.joints) >= DEGREES_OF_FREEDOM else ORIENTATION_COST_FEW_JOINTS
+    return Kinematics(model, "rip-tool", "site", len(config.joints), base, orientation_cost=cost)

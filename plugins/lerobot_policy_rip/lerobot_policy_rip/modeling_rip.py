@@ -13,10 +13,11 @@ from torch import Tensor
 
 from robust_instant_policy import RobustInstantPolicy, connect, load_demonstrations
 from robust_instant_policy.errors import RipError, UsageError
+from robust_instant_policy.motion.limits import Limits
 from robust_instant_policy.policies import Settings
 
 from .configuration_rip import RipConfig
-from .embodiment import Embodiment
+from .embodiment import SIMULATED, Embodiment
 from .planner import Calibration, Planner
 
 logger = logging.getLogger(__name__)
@@ -58,7 +59,10 @@ class RipPolicy(PreTrainedPolicy):
         """The next action ``(B, D)``."""
         if self._chunk is None:
             self._chunk = self.predict_action_chunk(batch)
-        action = self._chunk[:, min(self._step, self._chunk.shape[1] - 1)]
+        last = self._chunk.shape[1] - 1
+        action = self._chunk[:, min(self._step, last)]
+        if self._step == last:
+            logger.info("the motion has ended, the robot holds its position")
         self._step += 1
         return action
 
@@ -94,7 +98,12 @@ def _make_planner(config: RipConfig) -> Planner:
     triplets = np.concatenate([shown.trajectory.triplets for shown in demonstrations])
     camera = Calibration.of(demonstrations, config.intrinsics, config.camera_pose)
     embodiment = Embodiment(config.arms, triplets)
-    return Planner(policy, embodiment, camera, config.min_confidence, config.rate_hz, config.waypoint_hz)
+    limits = None
+    if not all(arm.model in SIMULATED for arm in config.arms):
+        if config.workspace is None:
+            raise UsageError("a real arm needs workspace=[[x, y, z], [x, y, z]], lower and upper corner in metres")
+        limits = Limits(np.array(config.workspace))
+    return Planner(policy, embodiment, camera, config.min_confidence, config.rate_hz, config.waypoint_hz, limits)
 
 
 def _folder(config: RipConfig) -> Path:

@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.guard import check_motion, check_waypoints, retimed
+from robust_instant_policy.motion.kinematics import Kinematics
+from robust_instant_policy.motion.limits import Limits
 from robust_instant_policy.motion.waypoints import plan_waypoints
 from robust_instant_policy.policies import Policy
 from robust_instant_policy.serving.planner import require_confidence
@@ -48,7 +51,10 @@ def _common(name: str, values: Sequence[FloatArray]) -> FloatArray:
 
 class Planner:
     """Plans with a fitted ``policy`` for the robot ``embodiment``, at ``rate_hz`` actions and ``waypoint_hz`` waypoints
-    per second; plans with a confidence below ``min_confidence`` are refused."""
+    per second; plans with a confidence below ``min_confidence`` are refused.
+
+    With ``limits`` the motion passes every check of a real arm; None leaves those of the simulated tasks.
+    """
 
     def __init__(
         self,
@@ -58,9 +64,11 @@ class Planner:
         min_confidence: float,
         rate_hz: float,
         waypoint_hz: float,
+        limits: Limits | None = None,
     ):
         self._policy, self._camera, self._min_confidence = policy, camera, min_confidence
         self._rate_hz, self._waypoint_hz = rate_hz, waypoint_hz
+        self._limits = limits
         self.embodiment = embodiment
 
     def plan(self, rgb: NDArray[np.uint8], depth: FloatArray, state: ArrayLike) -> FloatArray:
@@ -74,4 +82,9 @@ class Planner:
         plan = self._policy.plan(Observation(rgb, depth, self._camera.intrinsics, self._camera.pose))
         require_confidence(plan, self._min_confidence)
         motion = plan_waypoints(plan.trajectory, arms, self._waypoint_hz, self._rate_hz)
+        if self._limits is not None:
+            check_waypoints(plan.trajectory, arms, self._limits)
+            motion = retimed(motion, arms, self._rate_hz)
+            if all(isinstance(arm.kinematics, Kinematics) for arm in arms):  # links are known
+                check_motion(motion, arms, self._limits, self._rate_hz)
         return self.embodiment.to_robot(motion.commands)

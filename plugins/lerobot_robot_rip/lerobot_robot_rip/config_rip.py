@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lerobot.cameras import CameraConfig
 from lerobot.robots import RobotConfig
 from lerobot.teleoperators import TeleoperatorConfig
 
@@ -28,3 +29,14 @@ class RipTwinLeaderConfig(TeleoperatorConfig):
     """The demonstrator of the twin's task; it waits ``pause_s`` seconds before and after a demonstration."""
 
     pause_s: float = 2.0
+
+
+@CameraConfig.register_subclass("rip_realsense")
+@dataclass(kw_only=True)
+class RipRealSenseConfig(CameraConfig):
+    """A RealSense camera by its ``serial`` number; empty takes the only one connected."""
+
+    serial: str = ""
+    fps: int = 30
+    width: int = 640
+    height: int = 480

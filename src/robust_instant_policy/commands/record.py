@@ -41,7 +41,11 @@ def run(options: argparse.Namespace) -> int:
         with (
             screen.stage(f"{options.episodes} demonstrations"),
             DatasetWriter(
-                options.out, task=task.name, description=task.description, rate_hz=task.record_hz / options.every
+                options.out,
+                task=task.name,
+                description=task.description,
+                rate_hz=task.record_hz / options.every,
+                robot_type=getattr(task, "robot_type", None),
             ) as writer,
         ):
             thrown_away = record(

@@ -21,6 +21,8 @@ INFO_PATH = Path("meta/info.json")
 STATS_PATH = Path("meta/stats.json")
 TASKS_PATH = Path("meta/tasks.parquet")
 RIP_PATH = Path("meta/rip.json")
+CALIBRATION_PATH = Path("meta/calibration.json")
+CARD_PATH = Path("README.md")
 
 FILES_PER_CHUNK = 1000
 CHUNK_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"

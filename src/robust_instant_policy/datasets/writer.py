@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
+from robust_instant_policy.datasets.card import calibration, dataset_card
 from robust_instant_policy.datasets.folder import Folder, inside, open_folder, read_recording, read_seed
 from robust_instant_policy.datasets.images import encode_depth, encode_png
 from robust_instant_policy.datasets.statistics import Statistics, combine, feature_statistics, image_statistics
@@ -39,6 +40,8 @@ from robust_instant_policy.files import (
     write_error,
     write_whole,
 )
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
 EVEN_TIMING_TOLERANCE = 1e-6  # of an episode's duration
 EPISODE_FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.(?:parquet|png|mp4)$")
@@ -47,15 +50,16 @@ EPISODE_FILE = re.compile(r"chunk-(\d+)/file-(\d+)\.(?:parquet|png|mp4)$")
 class DatasetWriter:
     """Adds demonstrations to a new folder, or to one of an earlier writer.
 
-    All episodes have one ``task``, its ``description`` in words, and one recording rate. An episode is finished
-    when ``meta/info.json`` counts it: its files are written first, ``info.json`` last, each of them atomically.
-    A killed process leaves at most uncounted files, and the next writer removes them.
+    All episodes have one ``task``, its ``description`` in words, and one recording rate; ``robot_type`` names the
+    robot. An episode is finished when ``meta/info.json`` counts it: its files are written first, ``info.json``
+    last, each of them atomically. A killed process leaves at most uncounted files, and the next writer removes
+    them.
 
     Raises `DatasetError` for a folder of another task or rate, one with other content, one that another
     process is writing to, and if the disk is full.
     """
 
-    def __init__(self, path: str | Path, task: str, description: str, rate_hz: float):
+    def __init__(self, path: str | Path, task: str, description: str, rate_hz: float, robot_type: str | None = None):
         self.path = Path(path)
         self.task, self.description, self.rate_hz = task, description or task, float(rate_hz)
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
@@ -64,6 +68,7 @@ class DatasetWriter:
             make_folder(self.path)
         except OSError as error:
             raise write_error(self.path, error) from error
+        self.robot_type = robot_type
         self._folder: Folder | None = None
         self._statistics: dict[str, Statistics] = {}
         self._discarded_seeds: list[int | None] = []
@@ -109,15 +114,22 @@ class DatasetWriter:
         self._require_open()
         self._write_own([*self._discarded_seeds, seed])
 
-    def add(self, demonstration: Demonstration, images: NDArray[np.uint8] | None = None) -> None:
+    def add(
+        self,
+        demonstration: Demonstration,
+        images: NDArray[np.uint8] | None = None,
+        grippers: FloatArray | None = None,
+    ) -> None:
         """Append an episode, with ``images (T, H, W, 3)`` uint8 of all steps for all episodes or for none.
+
+        ``grippers (T, A)``, 0 open to 1 closed, were measured, for the state; else it holds the commanded ones.
 
         When this returns, the episode is on the disk; when it raises, the folder is unchanged.
         """
         self._require_open()
-        self._check(demonstration, images)
+        self._check(demonstration, images, grippers)
         try:
-            self._folder, self._statistics = self._write_episode(demonstration, images)
+            self._folder, self._statistics = self._write_episode(demonstration, images, grippers)
         except BaseException:
             self._take_up()
             raise
@@ -190,7 +202,9 @@ class DatasetWriter:
         write_whole(self.path / layout.RIP_PATH, _json(own))
         self._discarded_seeds = discarded_seeds
 
-    def _check(self, demonstration: Demonstration, images: NDArray[np.uint8] | None) -> None:
+    def _check(
+        self, demonstration: Demonstration, images: NDArray[np.uint8] | None, grippers: FloatArray | None
+    ) -> None:
         """Raise an error, before anything is written, for what the folder cannot hold."""
         trajectory = demonstration.trajectory
         if demonstration.task not in ("", self.task):
@@ -204,6 +218,8 @@ class DatasetWriter:
                 f"images must be ({len(trajectory)}, H, W, 3) uint8 like the trajectory, "
                 f"got {images.shape} {images.dtype}"
             )
+        if grippers is not None and np.shape(grippers) != trajectory.gripper_state.shape:
+            raise DatasetError(f"grippers must be {trajectory.gripper_state.shape}, got {np.shape(grippers)}")
         if self._folder is None:
             return
         features = self._folder.info["features"]
@@ -217,13 +233,13 @@ class DatasetWriter:
                 )
 
     def _write_episode(
-        self, demonstration: Demonstration, images: NDArray[np.uint8] | None
+        self, demonstration: Demonstration, images: NDArray[np.uint8] | None, grippers: FloatArray | None
     ) -> tuple[Folder, dict[str, Statistics]]:
         """Write an episode, its own files first; returns the folder and statistics with it."""
         episode = self.num_episodes
         first_frame = 0 if self._folder is None else self._folder.info["total_frames"]
         length = len(demonstration.trajectory)
-        columns = self._frame_columns(demonstration, episode, first_frame)
+        columns = self._frame_columns(demonstration, grippers, episode, first_frame)
         statistics: dict[str, Statistics] = {
             key: feature_statistics(value.reshape(length, -1)) for key, value in columns.items()
         }
@@ -253,16 +269,22 @@ class DatasetWriter:
         self._write_file(layout.EPISODES_PATTERN, episode, parquet(episode_table(row, statistics)))
         whole = _combined(self._statistics, statistics)
         features = features_of(demonstration.trajectory.num_arms, images, self.rate_hz)
+        self._write_calibration(demonstration, episode)
         info = self._write_dataset(features, whole, episode + 1, first_frame + length)
         earlier = [] if self._folder is None else self._folder.episodes
         return Folder(self.path, info, [*earlier, row]), whole
 
-    def _frame_columns(self, demonstration: Demonstration, episode: int, first_frame: int) -> dict[str, NDArray]:
+    def _frame_columns(
+        self, demonstration: Demonstration, grippers: FloatArray | None, episode: int, first_frame: int
+    ) -> dict[str, NDArray]:
         steps = np.arange(len(demonstration.trajectory))
         actions = demonstration.trajectory.actions.astype(np.float32)
+        state = actions.copy()
+        if grippers is not None:
+            state[:, STATE_INDEX::ACTION_DIM] = grippers
         return {
             layout.ACTION_KEY: actions,
-            layout.STATE_KEY: actions,
+            layout.STATE_KEY: state,
             "timestamp": (steps / self.rate_hz).astype(np.float32),
             "frame_index": steps,
             "episode_index": np.full_like(steps, episode),
@@ -284,13 +306,21 @@ class DatasetWriter:
             layout.INFO_COLUMN: json.dumps(dict(demonstration.info), sort_keys=True, default=_number),
         }
 
+    def _write_calibration(self, demonstration: Demonstration, episode: int) -> None:
+        """Write the camera's calibration beside the tables; remove it once the camera has moved."""
+        path, content = self.path / layout.CALIBRATION_PATH, _json(calibration(demonstration.observation))
+        if episode == 0:
+            write_whole(path, content)
+        elif path.exists() and path.read_bytes() != content:
+            path.unlink()
+
     def _write_dataset(
         self, features: dict[str, Any], statistics: Mapping[str, Statistics], num_episodes: int, num_frames: int
     ) -> dict[str, Any]:
         """Write the files about the whole folder; the last one, whose content is returned, finishes the episode."""
         info = {
             "codebase_version": layout.CODEBASE_VERSION,
-            "robot_type": None,
+            "robot_type": self.robot_type or (self._folder and self._folder.info.get("robot_type")),
             "total_episodes": num_episodes,
             "total_frames": num_frames,
             "total_tasks": 1,
@@ -305,6 +335,7 @@ class DatasetWriter:
         }
         if num_episodes == 1:
             write_whole(self.path / layout.TASKS_PATH, parquet(task_table(self.description)))
+        write_whole(self.path / layout.CARD_PATH, dataset_card(info, self.task, self.description))
         write_whole(self.path / layout.STATS_PATH, _json({key: listed(value) for key, value in statistics.items()}))
         write_whole(self.path / layout.INFO_PATH, _json(info))
         return info

@@ -71,7 +71,8 @@ def obtain_demonstrations(
         return shown
     every = max(1, round(task.record_hz / IMAGES_HZ)) if with_images else 1
     rate_hz = task.record_hz / every
-    with DatasetWriter(folder, task=task.name, description=task.description, rate_hz=rate_hz) as writer:
+    robot = getattr(task, "robot_type", None)
+    with DatasetWriter(folder, task.name, task.description, rate_hz, robot) as writer:
         seed = first_demonstration_seed(demo_set)
         record(task, writer, count, seed, with_images=with_images, every=every, on_progress=on_progress)
     return load_demonstrations(folder, task=task.name, limit=count)

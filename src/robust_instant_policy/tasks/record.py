@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import RipError
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.task import Image, Task, require
 
 MAX_FAILURES_IN_A_ROW = 50  # after as many failures in a row, recording stops
@@ -30,7 +31,9 @@ class DemonstrationWriter(Protocol):
     @property
     def discarded(self) -> int: ...
 
-    def add(self, demonstration: Demonstration, images: Image | None = None) -> None: ...
+    def add(
+        self, demonstration: Demonstration, images: Image | None = None, grippers: FloatArray | None = None
+    ) -> None: ...
 
     def discard(self, seed: int | None = None) -> None: ...
 
@@ -60,7 +63,7 @@ def record(
     while writer.num_episodes < num_episodes:
         attempt = task.demonstrate(seed, **asked)
         if attempt.success:
-            writer.add(replace(attempt.demonstration, task=task.name, seed=seed), attempt.images)
+            writer.add(replace(attempt.demonstration, task=task.name, seed=seed), attempt.images, attempt.grippers)
             in_a_row = 0
         else:
             writer.discard(seed)

@@ -24,6 +24,7 @@ from robust_instant_policy.trajectory import Trajectory
 
 HAND_STREAM = 1  # stream of the demonstrator's random numbers, separate from the scene's
 SEED_BITS = 32  # accepted by the simulators
+GRIPPER_DIGITS = 3  # of a measured gripper state: encoders of real grippers resolve no more
 SETTLE_SECONDS = 0.5  # at rest before a demonstration is judged
 
 Expert = Callable[[Any, np.random.Generator], Sequence[Stroke]]
@@ -183,19 +184,22 @@ class SimulatedTask:
         observation = self.reset(seed)
         poses, closed = self.expert_path()
         images: list[Image] = []
+        grippers: list[FloatArray] = []
         try:
             motion = plan_poses(poses, closed, self._arms, self._timing.control_hz)
         except UnreachableError as error:
             failure = str(error)
         else:
             poses, closed = motion.poses, motion.closed
-            self._play(motion, self._photographing(images, self._recorded(poses, every)) if with_images else _nothing)
+            steps = self._recorded(poses, every)
+            self._play(motion, self._observing(grippers, images if with_images else None, steps))
             self._rest(motion)
             failure = self._cell.failure()
         recorded = self._recorded(poses, every)
         trajectory = Trajectory.from_poses(poses[recorded], closed[recorded], self._triangle)
         demonstration = Demonstration(observation, trajectory, self.record_hz / every, self.name, seed)
-        return Attempt(demonstration, not failure, failure, np.array(images) if images else None)
+        measured = np.array(grippers) if grippers else None
+        return Attempt(demonstration, not failure, failure, np.array(images) if images else None, measured)
 
     @property
     def cell(self) -> Cell:
@@ -254,13 +258,18 @@ class SimulatedTask:
 
         return before_step
 
-    def _photographing(self, images: list[Image], steps: range) -> Callable[[], None]:
-        """Returns a function to call before each control step; it appends the image to ``images`` at ``steps``."""
+    def _observing(self, grippers: list[FloatArray], images: list[Image] | None, steps: range) -> Callable[[], None]:
+        """Returns a function to call before each control step; at ``steps`` it appends the measured gripper states
+        ``(A,)`` to ``grippers``, and the image to ``images``."""
         step = count()
 
         def before_step() -> None:
             if next(step) in steps:
-                images.append(self.look().rgb)
+                travel = self._cell.measured().reshape(len(self._arms), -1)[:, -1]
+                closed = 1 - travel / [arm.finger_travel for arm in self._arms]
+                grippers.append(np.round(closed, GRIPPER_DIGITS))
+                if images is not None:
+                    images.append(self.look().rgb)
 
         return before_step
 

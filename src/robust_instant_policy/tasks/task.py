@@ -64,12 +64,14 @@ class Execution:
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """One attempt of a demonstrator; ``images (T, H, W, 3)`` uint8, one per step, if requested."""
+    """One attempt of a demonstrator; ``images (T, H, W, 3)`` uint8, one per step, if requested; ``grippers (T,
+    A)`` are the measured gripper states, 0 open to 1 closed, where the task measures them."""
 
     demonstration: Demonstration
     success: bool
     failure: str = ""
     images: Image | None = field(default=None, repr=False)
+    grippers: FloatArray | None = field(default=None, repr=False)
 
 
 class Task(Protocol):

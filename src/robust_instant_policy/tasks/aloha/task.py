@@ -20,6 +20,7 @@ class CellTask(SimulatedTask):
     def __init__(self, spec: TaskSpec, objects: str, assets: str, level: Level):
         env = gymnasium.make(spec.env_id, objects=objects, obs_mode="none", level=level)
         cell: AlohaEnv = env.unwrapped
+        self.robot_type = "vx300s" if len(cell.end_effectors) == 1 else "bi_vx300s"
         super().__init__(spec, cell, [viperx(side) for side in cell.end_effectors], TIMING, WORKSPACE, level)
 
 

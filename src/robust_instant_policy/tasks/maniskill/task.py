@@ -10,6 +10,7 @@ from robust_instant_policy.tasks.level import Level, make_level
 from robust_instant_policy.tasks.maniskill.arm import EXECUTE_HZ, ur5e_hande
 from robust_instant_policy.tasks.maniskill.cell import RECORD_HZ, WORKSPACE
 from robust_instant_policy.tasks.maniskill.renderer import require_renderer
+from robust_instant_policy.tasks.maniskill.robot import UR5eHandE
 from robust_instant_policy.tasks.simulated_task import SimulatedTask, TaskSpec, Timing, spec_of
 
 TIMING = Timing(control_hz=RECORD_HZ, record_every=1, frame_every=4, execute_hz=EXECUTE_HZ)
@@ -20,6 +21,7 @@ class CellTask(SimulatedTask):
 
     def __init__(self, spec: TaskSpec, objects: str, assets: str, level: Level):
         require_renderer()
+        self.robot_type = UR5eHandE.uid
         env = gymnasium.make(
             spec.env_id, obs_mode="none", reward_mode="none", objects=objects, assets=assets, level=level
         )
