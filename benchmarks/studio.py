@@ -168,8 +168,10 @@ def tasks_in_turn(page: Page) -> list[float]:
     seconds = []
     for name in (*TASK_NAMES[1:TASKS_IN_TURN], TASK_NAMES[0]):
         start, before = time.monotonic(), page.inner_text("#studio-banner")
-        page.locator("input.mantine-Select-input").first.click()
-        page.get_by_role("option", name=name, exact=True).click()
+        tasks = page.locator("input.mantine-Select-input:visible").first
+        tasks.fill(name)
+        page.keyboard.press("ArrowDown")
+        page.keyboard.press("Enter")
         page.wait_for_function(
             """before => {
                 const text = document.querySelector("#studio-banner")?.innerText ?? "";

@@ -199,6 +199,15 @@ def test_a_frozen_state_stops_after_a_tenth_of_a_second(gate):
         gate.judge([same])
 
 
+def test_a_joint_that_is_held_a_little_away_from_a_command_at_rest_is_told(gate):
+    gate, arm = gate
+    held = arm.home + np.array([0, 0.15, 0, 0, 0, 0])
+    for step in range(int(0.5 * HZ)):
+        gate.judge([state(arm, held, clock=float(step))])
+    with pytest.raises(StoppedError, match=r"joint 2 rests away from its command by 0.15 rad, the limit is 0.117"):
+        gate.judge([state(arm, held, clock=-2.0)])
+
+
 def test_a_gripper_that_does_not_open_is_told(gate):
     gate, arm = gate
     for step in range(int(1.5 * HZ)):

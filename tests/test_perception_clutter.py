@@ -91,13 +91,7 @@ def test_things_that_change_places_keep_their_keypoints():
 
 def test_most_keypoints_are_on_what_the_hand_grasps():
     scenes = [blocks_at(seed, halves=(0.05, 0.025, 0.05)) for seed in range(4)]
-    paths = []
-    for blocks in scenes:
-        x, y, *_ = blocks[1]
-        tips = np.array([[0.0, 0.0, 0.4], [x, y, 0.15], [x, y, 0.04], [x, y, 0.04], [x, y, 0.2]])
-        up, side = np.array([0, 0, 0.1]), np.array([0, 0.02, 0])
-        actions = np.concatenate([tips + up, tips + side, tips - side], axis=1)
-        paths.append(Trajectory(np.column_stack([actions, [0, 0, 0, 1, 1]]), np.linspace(0, 1, len(tips))))
+    paths = [path_to(*blocks[1][:2]) for blocks in scenes]
     images = [photograph(blocks) for blocks in scenes]
     extractor = KeypointExtractor(features="efficientnet").fit(images, paths)
     assert owners(extractor.pixels_[0], images[0], scenes[0]).count(1) >= 6
@@ -115,3 +109,45 @@ def test_more_pixels_do_not_lose_a_small_thing_and_a_smaller_one_is_told():
     assert found == sorted(found)
     assert found[0] is False
     assert found[-1] is True
+
+
+def path_to(x: float, y: float, start=(0.0, 0.0, 0.4)) -> Trajectory:
+    """The fingertips' middle from ``start`` to the place, down, and up again with the gripper closed."""
+    tips = np.array([start, [x, y, 0.15], [x, y, 0.04], [x, y, 0.04], [x, y, 0.2]])
+    up, side = np.array([0, 0, 0.1]), np.array([0, 0.02, 0])
+    actions = np.concatenate([tips + up, tips + side, tips - side], axis=1)
+    return Trajectory(np.column_stack([actions, [0, 0, 0, 1, 1]]), np.linspace(0, 1, len(tips)))
+
+
+def test_a_gripper_in_the_image_gets_no_keypoints_and_is_told():
+    gripper = (0.24, 0.0, 0.04, 0.25, ((90, 90, 95), (60, 60, 65)))  # hovers at the start, away from the border
+    scenes = [blocks_at(seed, halves=(0.03,)) for seed in range(5)]
+    images = [photograph([*blocks, gripper]) for blocks in scenes]
+    paths = [path_to(*blocks[0][:2], start=(0.24, 0.0, 0.15)) for blocks in scenes]
+    extractor = KeypointExtractor(features="efficientnet").fit(images[:4], paths[:4])
+    assert set(owners(extractor.pixels_[0], images[0], scenes[0])) == {0}
+    located = extractor.locate(images[4])
+    assert set(owners(located.pixels, images[4], scenes[4])) == {0}
+    assert any("arm is in the image" in note for note in located.notes)
+
+
+def test_a_small_thing_in_a_box_of_its_colour_is_an_object_of_its_own():
+    red = ((190, 20, 20), (190, 20, 20))
+
+    def scene(seed: int):
+        rng = np.random.default_rng(seed)
+        x, y = rng.uniform(-0.07, 0.07, 2)
+        sides = [(side, along, 0.02, 0.05, red) for side in (-0.14, 0.14) for along in np.arange(-0.14, 0.15, 0.04)]
+        sides += [(along, side, 0.02, 0.05, red) for side in (-0.14, 0.14) for along in np.arange(-0.14, 0.15, 0.04)]
+        cube = (x, y, 0.025, 0.07, red)
+        return [cube], photograph([(0.0, 0.0, 0.14, 0.015, red), *sides, cube], size=256), path_to(x, y)
+
+    scenes = [scene(seed) for seed in range(7)]
+    extractor = KeypointExtractor(features="efficientnet").fit(
+        [image for _, image, _ in scenes[:5]], [path for _, _, path in scenes[:5]]
+    )
+    on_cube = np.array(owners(extractor.pixels_[0], scenes[0][1], scenes[0][0])) == 0
+    assert on_cube.sum() >= 4
+    for blocks, image, _ in scenes[5:]:
+        now = np.array(owners(extractor.locate(image).pixels, image, blocks)) == 0
+        assert (now & on_cube).sum() >= 0.8 * on_cube.sum()

@@ -154,15 +154,22 @@ def run(options: argparse.Namespace) -> int:
         LocalWorkers(options.workers or 1) if options.ray is None else RayWorkers(options.ray, options.workers)
     )
     suites = make_suites(options.suite or ["chosen"], choice)
-    evaluate(suites, setups, options.out, workers, ["rip", *options.arguments], options.keep)
+    arguments = ["rip", *options.arguments]
+    evaluate(suites, setups, options.out, workers, arguments, options.keep, options.workers or 1)
     return 0
 
 
 def evaluate(
-    suites: Sequence[Suite], setups: Sequence[Setup], out: Path, workers: Workers, arguments: Sequence[str], keep: bool
+    suites: Sequence[Suite],
+    setups: Sequence[Setup],
+    out: Path,
+    workers: Workers,
+    arguments: Sequence[str],
+    keep: bool,
+    recorders: int = 1,
 ) -> None:
     """Run what ``out`` lacks of ``suites`` with each set of demonstrations of ``setups`` and progress output, then
-    write tables, figures and page."""
+    write tables, figures and page. Demonstrations of ``recorders`` tasks are recorded at a time."""
     screen = StageConsole()
 
     def recording(task: str, there: int, count: int, thrown_away: int) -> None:
@@ -185,7 +192,7 @@ def evaluate(
     with screen.stage("evaluation"):
         for setup in setups:
             shown = [suite.with_demonstrations(setup.demo_set) for suite in suites]
-            run_suites(shown, setup, out, workers, progress, arguments, keep)
+            run_suites(shown, setup, out, workers, progress, arguments, keep, recorders)
     screen.say("")
     screen.say(publish(out))
     screen.say(f"rows: {out / EPISODES_FILE}; page: {out / PAGE_FILE}")

@@ -11,15 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.episodes import Episode, Trial
 from robust_instant_policy.evaluation.failures import Failure, video_file
 from robust_instant_policy.evaluation.manifest import code_digest
+from robust_instant_policy.evaluation.recording import Recording, record_all
 from robust_instant_policy.evaluation.scenes import (
     demonstration_digests,
     demonstrations_folder,
-    obtain_demonstrations,
     stored_demonstrations,
 )
 from robust_instant_policy.evaluation.store import ResultsStore
@@ -29,11 +28,9 @@ from robust_instant_policy.evaluation.work import Outcome, Planned, SceneWork, S
 from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.files import file_stem, lock_folder, make_folder, write_whole
 from robust_instant_policy.llm import model_name
-from robust_instant_policy.perception.network import choose_network, resolve_features
-from robust_instant_policy.perception.settings import PAPER_SIMULATION
+from robust_instant_policy.perception.network import resolve_features
 from robust_instant_policy.policies import IMAGE_METHODS, TRAINED_METHODS
 from robust_instant_policy.policies.training import TrainingReport, no_report
-from robust_instant_policy.tasks import make_task
 
 if TYPE_CHECKING:  # it needs the extra "train"
     from robust_instant_policy.policies.diffusion.training import TrainedPolicy
@@ -67,12 +64,14 @@ def run_suites(
     progress: Progress = Progress(),
     arguments: Sequence[str] = ("(called from Python)",),
     keep: bool = False,
+    recorders: int = 1,
 ) -> None:
     """Run what is missing of ``suites`` in ``out``: executions, and the analysis of failed ones.
 
-    Missing demonstrations are recorded in ``setup.data/TASK``. Plans that several suites contain are made once, and all
-    plans of a scene together, so that they share samples. Rows of another version of the code do not count as done
-    unless ``keep``; rows with other demonstrations never do. The manifest stores ``arguments``, the command line.
+    Missing demonstrations are recorded in ``setup.data/TASK``, of ``recorders`` tasks at a time. Plans that several
+    suites contain are made once, and all plans of a scene together, so that they share samples. Rows of another version
+    of the code do not count as done unless ``keep``; rows with other demonstrations never do. The manifest stores
+    ``arguments``, the command line.
     """
     suites = [identified(suite, setup) for suite in suites]
     make_folder(out)
@@ -83,7 +82,7 @@ def run_suites(
     ):
         results = store.results()
         executed = by_trial(results.episodes)
-        trials = _with_demonstrations(wanted_trials(suites), executed, setup, progress, keep)
+        trials = _with_demonstrations(wanted_trials(suites), executed, setup, progress, keep, recorders)
         if keep:
             complete = {_apart_from("code", trial) for trial, rows in executed.items() if is_complete(rows)}
             trials = [trial for trial in trials if trial in executed or _apart_from("code", trial) not in complete]
@@ -222,6 +221,7 @@ def _with_demonstrations(
     setup: Setup,
     progress: Progress,
     keep: bool,
+    recorders: int,
 ) -> list[Trial]:
     """``trials`` with the digest of their demonstrations. Missing demonstrations are recorded.
 
@@ -233,15 +233,17 @@ def _with_demonstrations(
     for scene, variant in trials:
         for with_images in {False, variant.method in IMAGE_METHODS}:
             most[scene.task, with_images] = max(variant.demos, most.get((scene.task, with_images), 0))
-    digests: dict[tuple[str, bool], list[str]] = {}
+    lacking = []
     for (task, with_images), count in most.items():
-        folder = demonstrations_folder(setup.data, task, with_images)
-        shown = stored_demonstrations(folder, task, count)
         of_task = [trial for trial in trials if trial[0].task == task]
-        if len(shown) < count and not all(plain(trial) in done for trial in of_task):
-            for features in {variant.features for _, variant in of_task if variant.method != "dp"}:
-                choose_network(features, PAPER_SIMULATION)  # missing weights are told before anything is recorded
-            shown = _record(of_task[0][0], setup.demo_set, folder, count, with_images, progress)
+        folder = demonstrations_folder(setup.data, task, with_images)
+        complete = len(stored_demonstrations(folder, task, count)) == count
+        if not complete and not all(plain(trial) in done for trial in of_task):
+            lacking.append(Recording(of_task[0][0], folder, count, with_images, setup.demo_set))
+    record_all(lacking, recorders, progress.recording)
+    digests = {}
+    for (task, with_images), count in most.items():
+        shown = stored_demonstrations(demonstrations_folder(setup.data, task, with_images), task, count)
         digests[task, with_images] = demonstration_digests(shown)
 
     def digest(trial: Trial) -> str:
@@ -250,17 +252,6 @@ def _with_demonstrations(
         return known[variant.demos] if variant.demos < len(known) else done[plain(trial)]
 
     return [(trial[0], replace(trial[1], demonstrations=digest(trial))) for trial in trials]
-
-
-def _record(
-    scene: Scene, demo_set: int, folder: Path, count: int, with_images: bool, progress: Progress
-) -> list[Demonstration]:
-    task = make_task(scene.task, assets=scene.assets, level=scene.level)
-    report = partial(progress.recording, scene.task)
-    try:
-        return obtain_demonstrations(task, folder, count, report, with_images, demo_set)
-    finally:
-        task.close()
 
 
 def _train_missing(works: Sequence[SceneWork], setup: Setup, progress: Progress) -> None:

@@ -23,9 +23,8 @@ import numpy as np
 
 from robust_instant_policy.datasets.video import FILM_OPTIONS, VideoEncoder
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import KeypointError, PlanningError
 from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey
-from robust_instant_policy.evaluation.rollout import ScenePolicy, execute
+from robust_instant_policy.evaluation.rollout import UNPLANNABLE, ScenePolicy, execute
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.perception import KeypointExtractor, Located
 from robust_instant_policy.perception.accuracy import KnownScene, measure
@@ -89,7 +88,7 @@ def true_keypoints(task: Task, seed: int, context: Context, shown_truth: Sequenc
         accuracy = measure(
             cast(KeypointExtractor, context.extractor), images, shown_truth, [observation], [task.scene_truth()]
         )
-    except KeypointError:
+    except UNPLANNABLE:
         return None
     found, truth = accuracy.located[0], accuracy.truth[0]
     if not accuracy.on_object:
@@ -132,7 +131,7 @@ class FailureAnalysis:
             return replace(found, stage="keypoints")
         try:
             plan = policy.plan(observation)
-        except PlanningError:
+        except UNPLANNABLE:
             return replace(found, stage="samples", good_candidate=False)
         if any(trajectory is candidate for trajectory in policy.executions(plan) for candidate in plan.candidates):
             return replace(found, stage="samples", good_candidate=False)
@@ -151,7 +150,7 @@ class FailureAnalysis:
     def _succeeds_with(self, located: Located, policy: ScenePolicy, candidate: int) -> bool:
         try:
             trajectories = policy.executions(policy.plan_scene(LocatedScene(located, Stage("keypoints", 0.0))))
-        except PlanningError:
+        except UNPLANNABLE:
             return False
         return self._plays(trajectories[min(candidate, len(trajectories) - 1)])
 
@@ -168,6 +167,6 @@ def film(task: Task, policy: ScenePolicy | ClosedLoopPolicy, observation: Observ
     else:
         try:
             execute(task, policy.executions(policy.plan(observation))[candidate], sink)
-        except (KeypointError, PlanningError):
+        except UNPLANNABLE:
             return b""
     return encoder.finish()

@@ -9,14 +9,30 @@ from typing import Protocol
 
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import KeypointError, PlanningError, UnreachableError
+from robust_instant_policy.errors import KeypointError, PlanningError, RipError, UnreachableError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import ClosedLoopPolicy, LocatedScene, Plan
-from robust_instant_policy.sanity import GeometryError
+from robust_instant_policy.sanity import DemonstrationError, GeometryError
 from robust_instant_policy.tasks.task import Execution, FrameSink, Task, require
 from robust_instant_policy.trajectory import Trajectory
+
+# What ends a plan and not the run: refusals, and defects in the mathematics, which the row names.
+UNPLANNABLE = (
+    GeometryError,
+    DemonstrationError,
+    KeypointError,
+    PlanningError,
+    ArithmeticError,
+    LookupError,
+    ValueError,
+)
+
+
+def reason(error: Exception) -> str:
+    """One line; an error that is none of this package's is named."""
+    return str(error) if isinstance(error, RipError) else f"unexpected {type(error).__name__}: {error}"
 
 
 class ScenePolicy(Protocol):
@@ -49,13 +65,13 @@ def roll_out(
     start = time.perf_counter()
     try:
         plan = policy.plan(observation)
-    except (GeometryError, KeypointError, PlanningError) as error:
+    except UNPLANNABLE as error:
         yield row(
             success=False,
             seconds=time.perf_counter() - start,
             physics_seconds=0.0,
             executed_seconds=0.0,
-            failure=f"no plan: {error}",
+            failure=f"no plan: {reason(error)}",
         )
         return
     trajectories = policy.executions(plan)

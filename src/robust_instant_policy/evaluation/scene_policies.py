@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import RipError
 from robust_instant_policy.policies import LocatedScene, Plan
 from robust_instant_policy.trajectory import Trajectory, downsample
 
@@ -15,7 +14,7 @@ from robust_instant_policy.trajectory import Trajectory, downsample
 class RefusingPolicy:
     """A policy that could not be fitted to the demonstrations: every plan raises the ``error``."""
 
-    error: RipError
+    error: Exception
 
     def plan(self, observation: Observation) -> Plan:
         raise self.error

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import KeypointError, ModelError, PlanningError
+from robust_instant_policy.errors import ModelError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import FailureAnalysis, Truth, film, true_keypoints
-from robust_instant_policy.evaluation.rollout import ScenePolicy, roll_out
+from robust_instant_policy.evaluation.rollout import UNPLANNABLE, ScenePolicy, roll_out
 from robust_instant_policy.evaluation.scene_policies import RefusingPolicy, ReplayedDemonstrator
 from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.variant import REPLAY, Scene, Variant
@@ -39,7 +39,6 @@ from robust_instant_policy.policies import (
 )
 from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.policies.training import TrainingReport, no_report
-from robust_instant_policy.sanity import DemonstrationError, GeometryError
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Task, offers, require
@@ -93,7 +92,7 @@ class Workbench:
         for variant in work.plans:
             policy = self._policy(variant)
             if not isinstance(policy, ClosedLoopPolicy):
-                with suppress(KeypointError, PlanningError):
+                with suppress(*UNPLANNABLE):
                     yield Planned(work.scene, variant, policy.plan(observation))
         if self._setup.analyses:
             yield from self._analyse(task, work.scene, failed, observation)
@@ -203,7 +202,7 @@ class Workbench:
                         if variant.replan
                         else RememberingPolicy(self, policy, variant.demos)
                     )
-                except (GeometryError, DemonstrationError, KeypointError) as error:
+                except UNPLANNABLE as error:
                     self._policies[variant] = RefusingPolicy(error)
             else:  # in closed loop; what it has after `fit` only makes it no `ClosedLoopPolicy` for isinstance yet
                 shown = self._read_demonstrations(self._place[0], variant.demos, with_images=True)
@@ -221,7 +220,7 @@ class Workbench:
             if key not in truths:
                 known = self._truth_of_demonstrations(demos)
                 truths[key] = None
-                with suppress(GeometryError, DemonstrationError, KeypointError):
+                with suppress(*UNPLANNABLE):
                     if known is not None:
                         truths[key] = true_keypoints(task, scene.seed, self.context(demos, settings), known)
             return truths[key]

@@ -21,6 +21,7 @@ from robust_instant_policy.motion.state import ArmState, Command
 
 TOLERANCE = 1.05  # of speeds and accelerations that were planned at the limit
 STALE_S = 0.1  # without a new reading; the watchdog's time
+SLOW_RAD_S, HELD_SHARE, HELD_S = 0.3, 1 / 3, 0.5  # a joint that is slow must be this near, after this time
 BLOCKED_S = 1.5  # that a gripper may take to open
 BLOCKED_SHARE = 0.3  # of its travel that it may lack then
 
@@ -45,6 +46,7 @@ class Gate:
         self._clocks, self._fresh, self._opening = [-math.inf] * len(states), [now] * len(states), [0] * len(states)
         self._last: list[Command] = [Command(state.joints, state.finger_travel) for state in states]
         self._change = np.zeros((len(states), len(states[0].joints)))
+        self._held = np.zeros_like(self._change)
         self.judge(states)
 
     @property
@@ -121,6 +123,7 @@ class Gate:
                 limit = self._limits.following_error
                 blocked = exceeded(arm.name, what, error[joint], limit, "rad", "following_error")
                 raise StoppedError(f"{blocked}; is something in its way, or is it overloaded?")
+            self._hold(index, error, arm.name)
             lacks = told.finger_travel - state.finger_travel > BLOCKED_SHARE * arm.finger_travel
             self._opening[index] = self._opening[index] + 1 if lacks else 0
             if self._opening[index] > BLOCKED_S * self._rate:
@@ -128,6 +131,17 @@ class Gate:
                     f"{arm.name}: the gripper is blocked: told to open to {1e3 * told.finger_travel:.0f} mm, it stands "
                     f"at {1e3 * state.finger_travel:.0f} mm; free it and check its cable"
                 )
+
+    def _hold(self, index: int, error: FloatArray, name: str) -> None:
+        """Raise `StoppedError` for a joint whose ``error (J,)`` lasts although its command hardly moves: it is held."""
+        limit = HELD_SHARE * self._limits.following_error
+        slow = np.abs(self._change[index]) * self._rate < SLOW_RAD_S
+        self._held[index] = np.where(slow & (error > limit), self._held[index] + 1, 0)
+        if self._held[index].max() > HELD_S * self._rate:
+            joint = int(np.argmax(self._held[index]))
+            what = f"joint {joint + 1} rests away from its command by"
+            held = exceeded(name, what, error[joint], limit, "rad", "a third of following_error")
+            raise StoppedError(f"{held}; is something in its way, or is it overloaded?")
 
 
 def _braked(wanted: FloatArray, before: FloatArray, speed: FloatArray, acceleration: FloatArray) -> FloatArray:

@@ -28,7 +28,8 @@ from robust_instant_policy.trajectory import Trajectory
 
 SMOOTHING_S = 0.12  # window of the moving average over joint commands: a jump of the speed is spread over it
 MAX_SLOWDOWN = 4.0  # a motion that needs more than this is not the one that was planned
-ROUNDING, ROUNDING_M = 1 + 1e-6, 1e-6
+HEADROOM = 0.95  # of speeds, for the difference between the measured joints and the first command
+ROUNDING_M = 1e-6
 HOME_MARGIN_M = 0.05  # around the box of workspace and home, in which an arm comes and goes
 UP_M = 0.10  # of the tool, before an arm goes to its park pose the direct way would be refused
 
@@ -80,12 +81,12 @@ def retimed(motion: Motion, arms: Sequence[Arm], rate_hz: float, speed: float = 
     total = 1.0
     for _ in range(6):
         needed, reason = _slowdown(motion, arms, rate_hz)
-        if needed <= ROUNDING:
+        if needed <= HEADROOM:
             return motion
         total *= needed
         if total > MAX_SLOWDOWN:
             break
-        motion = _stretched(motion, needed * 1.02)
+        motion = _stretched(motion, 1.02 * needed / HEADROOM)
     raise UnreachableError(f"{reason}; the motion would have to be {total:.1f} times slower")
 
 
@@ -94,7 +95,7 @@ def check_motion(motion: Motion, arms: Sequence[Arm], limits: Limits, rate_hz: f
     if not (np.isfinite(motion.joints).all() and np.isfinite(motion.fingers).all()):
         raise UnreachableError("the motion holds commands that are not numbers; plan again")
     needed, reason = _slowdown(motion, arms, rate_hz)
-    if needed > 1.02:
+    if needed > 1.0:
         raise UnreachableError(reason)
     for index, arm in enumerate(arms):
         check_joint_range(motion.joints[:, index], arm, rate_hz)

@@ -28,7 +28,7 @@ from robust_instant_policy.perception.registration import RESIDUAL_M, register_t
 from robust_instant_policy.perception.relevance import MIN_RELEVANCE, relevances, shares, still
 from robust_instant_policy.perception.selection import select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
-from robust_instant_policy.perception.view import View, make_view
+from robust_instant_policy.perception.view import Hands, View, make_view
 from robust_instant_policy.trajectory import Trajectory
 
 CORRESPONDENCES = ("registration", "nearest")
@@ -99,7 +99,8 @@ class KeypointExtractor:
         self.descriptor_name_ = self.network_.name
         if self.correspondence == "nearest":
             return self._fit_nearest(observations, note)
-        views = [make_view(observation, self.network_, self.workspace, self.seed) for observation in observations]
+        self._hands = Hands.at_start(trajectories) if trajectories else None
+        views = [self._view(observation) for observation in observations]
         notes = [note, *dict.fromkeys(line for view in views for line in view.notes)]
         if len(views) == 1:
             notes.append(
@@ -160,8 +161,11 @@ class KeypointExtractor:
             image = Image.of(observation, self.network_)
             cells, similarity = self._shared.find(image)
             return Located(image.points(cells), image.pixels(cells), similarity)
-        view = make_view(observation, self.network_, self.workspace, self.seed)
+        view = self._view(observation)
         return self._locate(view, register_all([thing.model for thing in self.objects_], view))
+
+    def _view(self, observation: Observation) -> View:
+        return make_view(observation, self.network_, self.workspace, self.seed, self._hands)
 
     def _locate(self, view: View, registrations: Sequence[Registration]) -> Located:
         """The keypoints of objects with known ``registrations`` in ``view``."""

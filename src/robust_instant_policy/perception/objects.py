@@ -22,7 +22,7 @@ from robust_instant_policy.perception.registration import (
     settle_turn,
     vote_for_motions,
 )
-from robust_instant_policy.perception.view import MIN_OBJECT_M2, TARGET_M, UNRELATED, View, subsample
+from robust_instant_policy.perception.view import MIN_OBJECT_M2, TARGET_M, UNRELATED, View, spread_out, subsample
 
 MAX_TEMPLATE_POINTS = 250
 MAX_TEMPLATE_CELLS = 80
@@ -87,12 +87,13 @@ IN_REFERENCE = Registration(np.eye(4), 1.0, 1.0, 0)
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """An object in one image, in the reference image's frame: ``xyzrgb (N, 6)`` in metres (see `View`), and the
-    ``view``'s ``cells (M,)`` with their ``points (M, 3)``.
+    """An object in one image, in the reference image's frame: a sample ``xyzrgb (N, 6)`` of its points in metres (see
+    `View`), its ``surface (S, 3)`` without gaps, and the ``view``'s ``cells (M,)`` with their ``points (M, 3)``.
     """
 
     view: View
     xyzrgb: Float32Array
+    surface: Float32Array
     cells: IntArray
     points: FloatArray
 
@@ -350,13 +351,13 @@ def _explained(
     models: Sequence[Model], found: Sequence[Registration] | Mapping[int, Registration], which: Sequence[int]
 ) -> FloatArray:
     """Points ``(N, 3)`` of the objects ``which``, where they were found."""
-    moved = [transform_points(found[i].motion, models[i].templates[found[i].template].xyzrgb[:, :3]) for i in which]
+    moved = [transform_points(found[i].motion, models[i].templates[found[i].template].surface) for i in which]
     return np.concatenate([np.zeros((0, 3)), *moved])
 
 
 def _claim(tree: cKDTree, model: Model, found: Registration) -> IntArray:
     """Numbers of the points in ``tree`` that an object explains."""
-    moved = transform_points(found.motion, model.templates[found.template].xyzrgb[:, :3])
+    moved = transform_points(found.motion, model.templates[found.template].surface)
     near = tree.query_ball_point(moved, CLAIM_M)
     return np.unique(np.concatenate([np.asarray(one, dtype=np.intp) for one in near]))
 
@@ -387,8 +388,8 @@ def _another_template(view: View, found: Registration, templates: Sequence[Templ
 
 def _template_of(home: View, piece: IntArray, seed: int) -> Template:
     """Of the points ``piece`` of the reference image."""
-    points = home.xyzrgb[subsample(piece, MAX_TEMPLATE_POINTS, seed)]
-    return _template(home, np.eye(4), points, points, seed)
+    points = home.xyzrgb[piece]
+    return _template(home, np.eye(4), points, points[subsample(np.arange(len(piece)), MAX_TEMPLATE_POINTS, seed)], seed)
 
 
 def _template(view: View, to_reference: FloatArray, xyzrgb: Float32Array, known: Float32Array, seed: int) -> Template:
@@ -399,7 +400,8 @@ def _template(view: View, to_reference: FloatArray, xyzrgb: Float32Array, known:
     near = np.flatnonzero(distance <= max(SAME_OBJECT_M, distance.min()))
     near = subsample(near, MAX_TEMPLATE_CELLS, seed)
     kept = subsample(np.arange(len(xyzrgb)), MAX_TEMPLATE_POINTS, seed)
-    return Template(view, xyzrgb[kept], view.cells[near], points[near])
+    surface = xyzrgb[spread_out(xyzrgb[:, :3])][:, :3]
+    return Template(view, xyzrgb[kept], surface, view.cells[near], points[near])
 
 
 def register(

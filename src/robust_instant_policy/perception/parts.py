@@ -19,7 +19,6 @@ GREATEST_M = 0.05  # distance that counts
 HIDDEN_M = 0.02  # behind the surface that the image shows there
 SMOOTHING_POINTS = 8
 THIN = 0.5  # of the greatest radius of a circle inside a piece
-MIN_SHARE = 0.05  # of a piece's points
 MIN_GAIN = 0.4  # of the distances, by a motion of its own
 MIN_DISTANCE_M = 0.004  # mean; less is the noise of the depth
 
@@ -53,7 +52,7 @@ def _connected(home: View, piece: IntArray, which: BoolArray) -> list[BoolArray]
     number = connected_pieces(home.points[piece[chosen]], GAP_M)
     parts = []
     for members in sorted((chosen[number == n] for n in np.unique(number)), key=len, reverse=True):
-        if len(members) >= max(home.least, MIN_SHARE * len(piece)):
+        if len(members) >= home.least:
             parts.append(np.isin(np.arange(len(piece)), members))
     return parts
 

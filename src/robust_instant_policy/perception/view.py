@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -23,6 +24,7 @@ from robust_instant_policy.perception.descriptors import (
 )
 from robust_instant_policy.perception.table import Table, levelling
 from robust_instant_policy.pointcloud import in_metres, steady
+from robust_instant_policy.trajectory import ACTION_DIM, Trajectory
 
 MAX_CENTRE_OFFSET = 0.4  # of the principal point from the image centre, of half the image
 SPACING_M = 0.003  # between points, where the image has as many: enough for millimetres, and fast
@@ -49,7 +51,10 @@ BORDER_SHARE = 0.01  # of the image's width and height, at its border
 HOVERING_M = 0.06  # above the table where it crosses the image's border: an arm or a person
 TALLEST_M = 0.8  # of what stands on a table
 
-TABLE, BELOW, BESIDE, HIGH, BORDER, SMALL, OUTSIDE, UNKNOWN, UNRELATED = -1, -2, -3, -4, -5, -6, -7, -8, -9
+HAND_SHARE = 0.5  # of the distance from the gripper point to the fingertips: what is nearer to it is the hand
+TOLD_BORDER_SHARE = 0.01  # of the image, that something at its border covers
+
+TABLE, BELOW, BESIDE, HIGH, BORDER, SMALL, OUTSIDE, UNKNOWN, UNRELATED, HAND = range(-1, -11, -1)
 REASONS = {
     TABLE: "table",
     BELOW: "below the table",
@@ -60,6 +65,7 @@ REASONS = {
     OUTSIDE: "outside the workspace",
     UNKNOWN: "no steady depth",
     UNRELATED: "no object that all demonstrations show",
+    HAND: "the gripper where the demonstrations start",
 }
 
 
@@ -92,15 +98,40 @@ class View:
     notes: tuple[str, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class Hands:
+    """Where grippers are in an image: their gripper ``points (A, 3)``, world, and how far they reach around these,
+    ``radii (A,)``, metres.
+    """
+
+    points: FloatArray
+    radii: FloatArray
+
+    @classmethod
+    def at_start(cls, trajectories: Sequence[Trajectory]) -> Hands:
+        """The median over ``trajectories``, at their start."""
+        first = np.median([path.actions[0] for path in trajectories], axis=0).reshape(-1, ACTION_DIM)
+        length = np.linalg.norm((first[:, 3:6] + first[:, 6:9]) / 2 - first[:, :3], axis=1)
+        return cls(first[:, :3], HAND_SHARE * length)
+
+    def near(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Which of ``points (N, 3)`` belong to a hand."""
+        return (np.linalg.norm(points[:, None] - self.points, axis=2) < self.radii).any(axis=1)
+
+
 def make_view(
-    observation: Observation, network: DescriptorNetwork, workspace: FloatArray | None = None, seed: int = 0
+    observation: Observation,
+    network: DescriptorNetwork,
+    workspace: FloatArray | None = None,
+    seed: int = 0,
+    hands: Hands | None = None,
 ) -> View:
     """Describe and segment an image.
 
     A point is foreground by its height above the table, or, when flat, by the network's saliency and a colour that
     differs from the table's. What is below or beside the table, outside ``workspace (2, 3)`` (metres, world; its lower
-    z is ignored), or reaches in over the border is not. Raises `KeypointError` for intrinsics of another resolution,
-    and for too few depth readings or foreground points.
+    z is ignored), or reaches in over the border is not, nor is a piece that holds a part of ``hands``. Raises
+    `KeypointError` for intrinsics of another resolution, and for too few depth readings or foreground points.
     """
     _check_resolution(observation)
     depth, note = in_metres(observation.depth)
@@ -131,6 +162,7 @@ def make_view(
     label[(label == 0) & (heights > TALLEST_M)] = HIGH
     label[~inside | ((label == 0) & (points[:, 2] > upper[2]))] = OUTSIDE
 
+    of_hand = hands.near(points) if hands is not None else np.zeros(len(points), dtype=bool)
     to_world = np.eye(4)
     if np.arccos(min(table.plane[2], 1.0)) > MIN_TILT_RAD:
         to_level = levelling(table.plane)
@@ -139,6 +171,7 @@ def make_view(
     foreground = np.flatnonzero(label == 0)
     label[foreground] = connected_pieces(points[foreground], max(GAP_M, GAP_PX * stride * pixel_m))
     _join_hidden(label, points, usable)
+    label[(label >= 0) & np.isin(label, label[of_hand])] = HAND
     small = _leave_out(label, heights, pixels, least)
 
     kept = np.flatnonzero(label >= 0)
@@ -154,11 +187,14 @@ def make_view(
     xyzrgb = np.concatenate([points, colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
     pieces = tuple(np.flatnonzero(label == piece) for piece in range(label.max() + 1))
     # Of equal density: near or separate things have no more weight than others.
-    target = xyzrgb[np.unique(np.floor(points / TARGET_M).astype(int), axis=0, return_index=True)[1]]
+    target = xyzrgb[spread_out(points)]
     cells, cell_points = _cell_points(descriptors.cells_at(pixels[kept]), label, points)
     neighbours = np.setdiff1d([descriptors.shifted(cells, row, col) for row, col in NEIGHBOURS], cells)
     cells = np.concatenate([cells, neighbours])
-    notes = tuple(line for line in (note, small) if line)
+    arm = ""
+    if (labels == HAND).any() or (labels == BORDER).mean() > TOLD_BORDER_SHARE:
+        arm = "an arm is in the image: it is left out, and what it hides is not seen; park it outside the image"
+    notes = tuple(line for line in (note, small, arm) if line)
     return View(
         observation,
         descriptors,
@@ -182,6 +218,11 @@ def subsample(indices: IntArray, count: int, seed: int) -> IntArray:
     if len(indices) <= count:
         return indices
     return np.sort(np.random.default_rng(seed).choice(indices, count, replace=False))
+
+
+def spread_out(points: ArrayLike) -> IntArray:
+    """Numbers of one of ``points (N, 3)``, metres, in each cube with edges of `TARGET_M`."""
+    return np.unique(np.floor(np.asarray(points) / TARGET_M).astype(int), axis=0, return_index=True)[1]
 
 
 def _cell_points(cells: IntArray, label: IntArray, points: FloatArray) -> tuple[IntArray, FloatArray]:

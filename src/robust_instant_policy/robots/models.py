@@ -23,7 +23,8 @@ TOOL = "tool"  # the frame between the fingertips, z along the approach, y along
 class ArmModel:
     """An arm with its gripper; see `Arm` for the units.
 
-    Without a URDF of our own, the user's: it must hold a link called `TOOL`, and its revolute joints are the arm's.
+    A user's own URDF must hold a link called `TOOL`; as many of its first joints as ``park`` has angles are the arm's,
+    a jaw after them is not.
     """
 
     urdf: Path
@@ -85,11 +86,12 @@ def arm_of(config: ArmConfig, folder: Path = Path()) -> Arm:
         compiled.body(TOOL)
     except (ValueError, KeyError, AttributeError) as error:
         raise CellError(f"{model.urdf} cannot be used: {error}; it needs a link called {TOOL}") from None
-    revolute = int((compiled.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).sum())
-    if len(config.park) != revolute:
-        raise CellError(f"{config.name}: park must hold {revolute} angles, one for each joint, not {len(config.park)}")
+    count = len(config.park)
+    revolute = int(np.cumprod(compiled.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).sum())
+    if count == 0 or count > revolute or (config.model in KNOWN and count != revolute):
+        raise CellError(f"{config.name}: park must hold {revolute} angles, one for each joint, not {count}")
     triangle = config.gripper or model.triangle
-    kinematics = Kinematics(compiled, TOOL, "body", revolute, config.base, model.posture_cost, model.orientation_cost)
+    kinematics = Kinematics(compiled, TOOL, "body", count, config.base, model.posture_cost, model.orientation_cost)
     return Arm(
         name=config.name,
         kinematics=kinematics,

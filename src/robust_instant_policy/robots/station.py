@@ -72,7 +72,7 @@ class Station:
         self.followers: tuple[Follower, ...] = tuple(
             make_follower(arm, one.driver, config.rate_hz) for arm, one in zip(self.arms, config.arms, strict=True)
         )
-        stale_s = STALE_S if config.emulation is None else EMULATED_STALE_S
+        stale_s = STALE_S if config.emulation is None else max(EMULATED_STALE_S / config.pace, 2 * STALE_S)
         self.sent_at = 0.0  # of the last command, seconds of a clock that does not jump
         self.gate = Gate(self.arms, config.limits, config.rate_hz, stale_s)
 

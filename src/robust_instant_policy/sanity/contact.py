@@ -22,8 +22,9 @@ class Contact:
 
     ``path`` is the smallest gap over the path between the fingers and a raised surface (0: it passes through what
     the image shows there); ``grasps (G,)`` the gaps where grippers close; ``lowest`` the smallest height of a
-    fingertip above the table, ``lowest_gripper_point`` that of a gripper point; ``buried`` the largest depth of
-    a gripper point behind a raised surface.
+    fingertip above the table, ``lowest_gripper_point`` that of a gripper point, where the table is seen: elsewhere
+    there may be a hole; ``buried`` the largest depth of a gripper point behind a raised surface that also lies above
+    it: what is only behind one may be free, if the camera looks from the side.
     """
 
     path: float
@@ -79,11 +80,13 @@ def gaps(view: View, points: FloatArray) -> FloatArray:
 def contact(view: View, path: GripperPath) -> Contact:
     """How ``path`` lies to the scene of ``view``."""
     behind, raised = view.behind_surface(path.gripper_points)
-    buried = behind[raised & np.isfinite(behind)]
+    hidden = raised & np.isfinite(behind)
+    hidden[hidden] = view.covered(path.gripper_points[hidden])
+    buried = behind[hidden]
     return Contact(
         path=float(gaps(view, path.fingers).min()),
         grasps=gaps(view, path.closings),
-        lowest=float(view.above_plane(path.tips).min()),
-        lowest_gripper_point=float(view.above_plane(path.gripper_points).min()),
+        lowest=float(view.above_table(path.tips).min()),
+        lowest_gripper_point=float(view.above_table(path.gripper_points).min()),
         buried=float(buried.max(initial=0.0)),
     )

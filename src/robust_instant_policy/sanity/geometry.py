@@ -38,8 +38,8 @@ class Evidence:
     """How well paths and images fit, as shares of the demonstrations (0 to 1).
 
     ``touching``: the path meets a raised surface; ``grasping``: so does the gripper where it closes (share of all
-    closings); ``clear``: no fingertip is below the table and no gripper point inside a surface; ``level``: the camera
-    is above the table and the readings lie on one plane.
+    closings); ``clear``: no fingertip is below the table and no gripper point inside a surface; ``above``: the former
+    alone; ``level``: the camera is above the table and the readings lie on one plane.
     """
 
     contacts: tuple[Contact, ...]
@@ -47,6 +47,7 @@ class Evidence:
     touching: float
     grasping: float
     clear: float
+    above: float
     level: float
 
     @property
@@ -56,6 +57,10 @@ class Evidence:
     @property
     def is_clear(self) -> bool:
         return self.clear >= MIN_SHARE
+
+    @property
+    def is_above(self) -> bool:
+        return self.above >= MIN_SHARE
 
     @property
     def is_right(self) -> bool:
@@ -97,11 +102,15 @@ def touch_distance(view: View) -> float:
     return TOUCH_M + TOUCH_DEVIATIONS * view.noise
 
 
+def is_above(contact: Contact, view: View) -> bool:
+    """Whether a path stays above the table."""
+    lowest = min(contact.lowest, contact.lowest_gripper_point)
+    return lowest > -(BELOW_TABLE_M + 2 * view.noise) or not view.is_support
+
+
 def fits(contact: Contact, view: View) -> bool:
     """Whether a path stays above the table and outside of what the image shows."""
-    lowest = min(contact.lowest, contact.lowest_gripper_point)
-    above = lowest > -(BELOW_TABLE_M + 2 * view.noise) or not view.is_support
-    return above and contact.buried < BURIED_M
+    return is_above(contact, view) and contact.buried < BURIED_M
 
 
 def evidence(views: Sequence[View], paths: Sequence[GripperPath], poses: Sequence[FloatArray]) -> Evidence:
@@ -115,6 +124,7 @@ def evidence(views: Sequence[View], paths: Sequence[GripperPath], poses: Sequenc
         touching=float(np.mean([c.path < near for c, near in zip(contacts, reach, strict=True)])),
         grasping=float(closings.mean()) if len(closings) else 0.0,
         clear=float(np.mean([fits(c, view) for c, view in zip(contacts, views, strict=True)])),
+        above=float(np.mean([is_above(c, view) for c, view in zip(contacts, views, strict=True)])),
         level=float(np.mean([view.share_on_plane * (view.camera_height > 0) for view in views])),
     )
 

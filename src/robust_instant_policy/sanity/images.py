@@ -14,23 +14,27 @@ from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.geometry import (
     BURIED_M,
     CONSISTENT,
+    FAR_M,
     MIN_SHARE,
     TOUCH_M,
     Evidence,
     Explanation,
     explain,
     fits,
+    is_above,
     pairing_scores,
 )
 from robust_instant_policy.sanity.view import View
 
 OWN_BETTER = 0.2  # by which the own images' consistency must exceed that of other images,
+SAME_EVERYWHERE = 0.95  # from which on what is around the gripper looks alike in all scenes, and nothing is told
 ROOM = 0.5  # and less where these leave less than that to the greatest, 1: scenes of which little moves
 CLOSE_M = 0.015  # gap from which a path is compared with other hypotheses, too
 ONE_SCENE_M = 0.01  # spread of the objects below which all demonstrations show one scene
 UNLIKE = 0.25  # likeness below which a demonstration contradicts the others,
 ALIKE = 0.6  # where their median is at least this
 FAR_FROM_ALL_M = 0.06  # gap of a path that alone touches nothing
+MUCH_BETTER = 0.2  # by which the consistency under a hypothesis must be higher where the images nearly fit as they are
 LESS_CONSISTENT = 0.05  # by which the consistency under a hypothesis may be lower
 
 
@@ -63,8 +67,14 @@ def check_contact(
     # a hypothesis under which the surroundings repeat less comes nearer by chance
     if explanation and not (right and explanation.evidence.surroundings.score < score - LESS_CONSISTENT):
         words = f"{_measured(as_is)}; {_explained(explanation)}"
-        # where the images do fit as they are, a hypothesis that fits better proves nothing
-        fits_as_is = right or (as_is.touches and as_is.is_clear and explanation.displaced)
+        # Where the images do fit as they are, a hypothesis that fits better proves nothing. Things are also pushed with
+        # another part of a hand than its fingertips, and what lies behind or under a surface may be free.
+        better = explanation.evidence.surroundings.score - score
+        clear = as_is.is_clear or (
+            as_is.is_above and score >= CONSISTENT and (explanation.displaced or better < MUCH_BETTER)
+        )
+        nearly = as_is.path_gap < FAR_M and better < MUCH_BETTER
+        fits_as_is = right or (clear and (nearly or (as_is.touches and (explanation.displaced or not as_is.is_clear))))
         return [Finding("contact", "warning" if fits_as_is else "error", words, numbers, explanation.cause)]
     if right:
         return _outliers(views, as_is)
@@ -75,21 +85,25 @@ def check_contact(
 def _unexplained(views: Sequence[View], as_is: Evidence, own: float, other: float) -> tuple[Severity, str, str]:
     """Severity, words and cause where no hypothesis fits; consistency with the ``own`` and ``other`` images."""
     closes = any(len(c.grasps) for c in as_is.contacts)
+    score = as_is.surroundings.score
     if not as_is.is_clear:
-        return "error", f"{_measured(as_is)}; check the camera's pose, the depth unit and the tool's offset", ""
+        severity: Severity = "warning" if as_is.is_above and as_is.touches and score >= CONSISTENT else "error"
+        return severity, f"{_measured(as_is)}; check the camera's pose, the depth unit and the tool's offset", ""
     if not any(view.raised.any() for view in views):
         words = "nothing in the images stands above the table: whether images and paths belong together was not checked"
         return "warning" if closes else "unchecked", words, "flat depth: nothing raised"
-    if not as_is.touches and closes:
+    if not as_is.touches and closes and as_is.path_gap >= FAR_M:
         advice = "check the camera's pose, the tool's offset and which image belongs to which path"
         return "error", f"{_measured(as_is)}; {advice}", ""
     if not as_is.touches:
         return "warning", f"{_measured(as_is)}; nothing closes there, so it was not checked further", ""
-    if _fit_others(own, other):
+    if _fit_others(own, other) and own < SAME_EVERYWHERE:
         words = f"the paths fit their own images no better than each other's ({own:.2f} against {other:.2f} of 1)"
         advice = "trajectories are shuffled against images, or the images are mirrored, or of another camera"
         return "error", f"{words}; {advice}", "other images"
-    score = as_is.surroundings.score
+    if own >= SAME_EVERYWHERE:
+        words = f"what the images show around the gripper is alike in all scenes ({own:.2f} of 1)"
+        return "unchecked", f"{words}: whether each path belongs to its image was not decided", ""
     words = f"what the images show around the gripper hardly repeats across the demonstrations ({score:.2f} of 1)"
     return "unchecked", f"{words}: whether the camera is right was not decided", ""
 
@@ -148,7 +162,8 @@ def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
             f"its lowest fingertip is {c.lowest * 1e3:.0f} mm above the table, and it is {likeness[index]:.2f} like "
             f"the others ({usual:.2f}); look at it, and remove it if it is wrong"
         )
-        severity: Severity = "error" if apart or not fits(c, view) else "warning"
+        below = not is_above(c, view) and likeness[index] < ALIKE
+        severity: Severity = "error" if apart or below else "warning"
         numbers = {"demonstration": float(index), "path_gap": c.path, "likeness": float(likeness[index])}
         found.append(Finding("contradiction", severity, words, numbers, f"demonstration {index}"))
     return found

@@ -24,6 +24,8 @@ MIN_POINTS = 100  # readings below which an image says nothing
 PLANE_SEED = 0
 FAR_AWAY_M = 1e3
 COLUMN_SPACINGS = 1.0  # of the grid's points on the surface, between a point and one measured straight above it
+HOLE_M = 0.015  # from a point to the nearest one of the table, seen from above: beyond it there may be a hole
+BESIDE_HOLE_M = 0.06  # from a point to one seen deeper than the table: within it there may be a hole
 COVER_M = 0.005  # of surface above a point that is inside a thing
 
 
@@ -109,9 +111,15 @@ class View:
         return self.raised_points.mean(axis=0) if len(self.raised_points) else np.full(3, np.nan)
 
     @cached_property
+    def deeper_points(self) -> FloatArray:
+        """``(N, 3)`` metres, world: below the table, such as in a hole."""
+        return self.points[self.height < -max(RAISED_M, RAISED_DEVIATIONS * self.noise)]
+
+    @cached_property
     def tree(self) -> cKDTree:
-        """Nearest raised point; where nothing is raised, one far away."""
-        return cKDTree(self.raised_points if len(self.raised_points) else np.full((1, 3), FAR_AWAY_M))
+        """Nearest point beside the table's plane; where there is none, one far away."""
+        beside = np.concatenate([self.raised_points, self.deeper_points if self.is_support else self.points[:0, 0]])
+        return cKDTree(beside if len(beside) else np.full((1, 3), FAR_AWAY_M))
 
     @cached_property
     def columns(self) -> cKDTree:
@@ -130,6 +138,22 @@ class View:
     def above_plane(self, points: FloatArray) -> FloatArray:
         """Heights ``(...)`` of ``points (..., 3)`` above the table, metres."""
         return points @ self.plane[:3] + self.plane[3]
+
+    def above_table(self, points: FloatArray) -> FloatArray:
+        """Heights ``(N,)`` of ``points (N, 3)`` above the table, metres; 0 below its plane where no table is seen, or
+        something deeper: a hole."""
+        height = self.above_plane(points)
+        below = height < 0
+        if below.any():
+            thick = max(RAISED_M, RAISED_DEVIATIONS * self.noise)
+            level = self.points[np.abs(self.height) < thick][:, :2]
+            deeper = self.deeper_points[:, :2]
+            at_table, at_hole = (
+                cKDTree(some).query(points[below, :2])[0] if len(some) else np.full(int(below.sum()), np.inf)
+                for some in (level, deeper)
+            )
+            height[below] = np.where((at_table < HOLE_M) & (at_hole > BESIDE_HOLE_M), height[below], 0.0)
+        return height
 
     def behind_surface(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """How far ``points (N, 3)`` lie behind the surface seen at their pixels, metres, and whether that is raised.

@@ -11,7 +11,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -76,15 +76,25 @@ class UR:
             self._check_dashboard()
             self._receive = rtde_receive.RTDEReceiveInterface(self._address, RECEIVE_HZ, VARIABLES)
             self._control = rtde_control.RTDEControlInterface(self._address, RECEIVE_HZ)
-        except (RuntimeError, ValueError) as error:  # the library raises std::exception, which becomes RuntimeError
+            self._gripper.connect()
+        except RobotError:
+            self.disconnect()
+            raise
+        except (RuntimeError, ValueError) as error:
             self.disconnect()
             raise RobotError(
                 f"{self.name}: the controller at {self._address} refuses RTDE: {error}; is it in remote control?"
             ) from None
-        self._gripper.connect()
 
     def state(self) -> ArmState:
-        receive = self._require(self._receive)
+        with self._errors():
+            return self._state(self._require(self._receive))
+
+    def command(self, command: Command) -> None:
+        with self._errors():
+            self._command(self._require(self._control), command)
+
+    def _state(self, receive: rtde_receive.RTDEReceiveInterface) -> ArmState:
         if not receive.isConnected():
             raise RobotError(f"{self.name}: the RTDE connection to {self._address} was lost; check the network cable")
         travel, load = self._gripper.read()
@@ -98,8 +108,7 @@ class UR:
             faults=_faults(bits),
         )
 
-    def command(self, command: Command) -> None:
-        control = self._require(self._control)
+    def _command(self, control: rtde_control.RTDEControlInterface, command: Command) -> None:
         if not self._serving:
             self._start(control)
         if not control.servoJ(command.joints.tolist(), 0.0, 0.0, self._step, LOOKAHEAD_S, GAIN):
@@ -156,6 +165,16 @@ class UR:
             raise RobotError(f"{self.name}: {mode}; switch the arm on and release its brakes on the teach pendant")
         if "NORMAL" not in safety and "REDUCED" not in safety:
             raise RobotError(f"{self.name}: {safety}; clear it on the teach pendant, then run again")
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        """The library raises std::exception, also from its attempts to connect again; it becomes RuntimeError."""
+        try:
+            yield
+        except RuntimeError as error:
+            raise RobotError(
+                f"{self.name}: the connection to {self._address} was lost ({error}); check the network cable"
+            ) from None
 
     def _require(self, interface):
         if interface is None:

@@ -23,10 +23,10 @@ WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)  # Meta-World's 
 CONTROL_HZ = 80.0
 HORIZON = 500  # control steps of an episode, Meta-World's own
 STEP_M = 0.01  # by which an action of 1 moves the mocap body
-SIDE_PX = 256
+WIDTH_PX, HEIGHT_PX = 384, 256
 LOOK_AT_M, DISTANCE_M = (0.0, 0.68, 0.05), 1.05  # above and behind the robot's base, which is at the origin
 ELEVATION_DEG = -50.0
-FILM_CAMERA, FILM_PX = "corner3", 320
+FILM_CAMERA, FILM_PX = "corner3", (320, 320)
 HIDDEN_GROUP = 5  # of the robot's shapes, which the depth camera does not see
 
 
@@ -51,7 +51,7 @@ class Environment:
         base = self.model.body("base").id
         self.model.geom_group[self.model.body_rootid[self.model.geom_bodyid] == base] = HIDDEN_GROUP
         self.model.site_group[self.model.body_rootid[self.model.site_bodyid] == base] = HIDDEN_GROUP
-        self._renderers: dict[int, mujoco.Renderer] = {}
+        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         self._seen: FloatArray = np.zeros(0)  # the expert's observation
 
     def reset(self, seed: int) -> None:
@@ -96,20 +96,19 @@ class Environment:
 
     def photograph(self) -> Observation:
         """What the depth camera sees; the robot is not drawn."""
-        renderer = self._renderer(SIDE_PX)
+        renderer = self._renderer(WIDTH_PX, HEIGHT_PX)
         renderer.update_scene(self.data, _camera())
         rgb = renderer.render().copy()
         renderer.enable_depth_rendering()
         depth = renderer.render().copy()
         renderer.disable_depth_rendering()
-        focal = SIDE_PX / 2 / np.tan(np.deg2rad(self.model.vis.global_.fovy) / 2)
-        middle = (SIDE_PX - 1) / 2
-        intrinsics = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+        focal = HEIGHT_PX / 2 / np.tan(np.deg2rad(self.model.vis.global_.fovy) / 2)
+        intrinsics = np.array([[focal, 0, (WIDTH_PX - 1) / 2], [0, focal, (HEIGHT_PX - 1) / 2], [0, 0, 1]])
         return Observation(rgb, depth.astype(np.float32), intrinsics, _camera_pose())
 
     def scene_truth(self) -> SceneTruth:
         """Bodies and goal sites at the pixels of the camera, and their poses."""
-        renderer = self._renderer(SIDE_PX)
+        renderer = self._renderer(WIDTH_PX, HEIGHT_PX)
         renderer.update_scene(self.data, _camera())
         renderer.enable_segmentation_rendering()
         seen, kind = np.moveaxis(renderer.render(), -1, 0)
@@ -130,7 +129,7 @@ class Environment:
 
     def video_frame(self) -> Image:
         """A frame of one of the benchmark's own cameras, with the robot."""
-        renderer = self._renderer(FILM_PX)
+        renderer = self._renderer(*FILM_PX)
         options = mujoco.MjvOption()
         options.geomgroup[HIDDEN_GROUP] = 1
         renderer.update_scene(self.data, FILM_CAMERA, options)
@@ -148,10 +147,10 @@ class Environment:
         for site, place in self.env._target_site_config:
             self.env._set_pos_site(site, place)
 
-    def _renderer(self, side: int) -> mujoco.Renderer:
-        if side not in self._renderers:
-            self._renderers[side] = mujoco.Renderer(self.model, side, side)
-        return self._renderers[side]
+    def _renderer(self, width: int, height: int) -> mujoco.Renderer:
+        if (width, height) not in self._renderers:
+            self._renderers[width, height] = mujoco.Renderer(self.model, height, width)
+        return self._renderers[width, height]
 
 
 def _camera() -> mujoco.MjvCamera:

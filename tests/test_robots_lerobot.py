@@ -1,0 +1,130 @@
+"""LeRobot's robots: a class of the shape of its ``Robot`` follows plans through the adapter."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robust_instant_policy.errors import CellError
+from robust_instant_policy.motion.guard import plan_guarded
+from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.signals import StopRequest
+from robust_instant_policy.robots.station import Station
+from robust_instant_policy.trajectory import Trajectory
+
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+SIGNS, OFFSETS = (1, -1, 1, 1, 1), (0, 10, 0, 0, 0)
+PARK = (0.9, -0.6, 1.2, 0.9, 0.0)
+AXES = ("0 0 1", "0 1 0", "0 1 0", "0 1 0", "1 0 0")
+ORIGINS = ("0 0 0.06", "0 0 0.05", "0.03 0 0.11", "0.13 0 0", "0.06 0 0")
+
+
+def urdf() -> str:
+    """A desktop arm of five joints, with a jaw."""
+    text = '<robot name="desk"><link name="base"/>'
+    before = "base"
+    for name, axis, origin in zip(JOINTS, AXES, ORIGINS, strict=True):
+        text += (
+            f'<joint name="{name}" type="revolute"><parent link="{before}"/><child link="{name}_link"/>'
+            f'<origin xyz="{origin}"/><axis xyz="{axis}"/><limit lower="-2" upper="2" velocity="3" effort="3"/></joint>'
+            f'<link name="{name}_link"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>'
+        )
+        before = f"{name}_link"
+    text += (
+        f'<joint name="jaw" type="revolute"><parent link="{before}"/><child link="jaw_link"/><origin xyz="0.04 0 0"/>'
+        '<axis xyz="0 0 1"/><limit lower="0" upper="1" velocity="3" effort="3"/></joint><link name="jaw_link">'
+        '<collision><geometry><sphere radius="0.01"/></geometry></collision></link>'
+        f'<joint name="mount" type="fixed"><parent link="{before}"/><child link="tool"/><origin xyz="0.08 0 0" '
+        'rpy="3.141592653589793 -1.570796326794897 0"/></joint><link name="tool"/></robot>'
+    )
+    return text
+
+
+class Desk:
+    """Follows its actions at once, in degrees and percent, as LeRobot's robots do."""
+
+    def __init__(self) -> None:
+        self.config = SimpleNamespace(disable_torque_on_disconnect=True)
+        degrees = np.array(SIGNS) * np.rad2deg(PARK) + OFFSETS
+        self.values = {f"{name}.pos": float(value) for name, value in zip(JOINTS, degrees, strict=True)}
+        self.values["gripper.pos"] = 100.0
+        self.broken = False
+
+    def connect(self) -> None:
+        assert not self.config.disable_torque_on_disconnect  # it would fall at the end
+
+    def get_observation(self) -> dict:
+        if self.broken:
+            raise ConnectionError("no status packet")
+        return {**self.values, "front": np.zeros((4, 4, 3))}
+
+    def send_action(self, action: dict) -> dict:
+        self.values.update(action)
+        return action
+
+    def disconnect(self) -> None: ...
+
+
+@pytest.fixture
+def cell(tmp_path, monkeypatch):
+    module = SimpleNamespace(desk=Desk())
+    module.make = lambda: module.desk
+    monkeypatch.setitem(sys.modules, "my_robot", module)
+    (tmp_path / "desk.urdf").write_text(urdf())
+    (tmp_path / "gripper.toml").write_text("length = 0.06\nopening = 0.05\n")
+    keys = " ".join(f"{name}.pos" for name in JOINTS)
+    path = tmp_path / "cell.toml"
+    path.write_text(
+        f"[cell]\nrate_hz = 100\nworkspace = [[-0.1, -0.4, 0.0], [0.45, 0.4, 0.5]]\n[[arms]]\nname = 'desk'\n"
+        f"model = 'desk.urdf'\npark = {list(PARK)}\ngripper = 'gripper.toml'\njoint_speed = 5\ntool_speed = 1\n"
+        f"driver = {{ kind = 'lerobot', factory = 'my_robot:make', keys = '{keys}', signs = {list(SIGNS)}, "
+        f"offsets = {list(OFFSETS)} }}\n"
+    )
+    return path, module.desk
+
+
+def turn(station: Station):
+    """Turn about the base by 0.4 rad: reachable with five joints."""
+    (arm,) = station.arms
+    joints = np.array([arm.home + np.array([angle, 0, 0, 0, 0]) for angle in (0.0, -0.2, -0.4)])
+    poses = np.array([arm.kinematics.tool_pose(row) for row in joints])
+    trajectory = Trajectory.from_poses(poses, [0.0, 0.0, 1.0], arm.triangle)
+    return plan_guarded(trajectory, station.arms, station.config.limits, 5.0, station.rate_hz)
+
+
+def test_a_plan_arrives_in_the_robots_own_units_and_its_torque_stays_on(cell):
+    path, desk = cell
+    with Station(CellConfig.load(path)) as station:
+        motion = turn(station)
+        played = station.play(motion, StopRequest())
+    assert not played.stopped
+    sent = np.array([desk.values[f"{name}.pos"] for name in JOINTS])
+    np.testing.assert_allclose(sent, np.array(SIGNS) * np.rad2deg(motion.joints[-1, 0]) + OFFSETS, atol=1e-9)
+    assert desk.values["gripper.pos"] == pytest.approx(0.0)
+
+
+def test_a_robot_that_does_not_answer_stops_the_run_and_is_named(cell):
+    path, desk = cell
+    with Station(CellConfig.load(path)) as station:
+        motion = turn(station)
+        desk.broken = True
+        played = station.play(motion, StopRequest())
+    assert "desk does not answer: no status packet" in played.stopped
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("wrist_roll.pos", "", "keys must name 5 joints"),
+        ("'my_robot:make'", "'my_robot:nothing'", "factory must be module:function"),
+        ("'desk.urdf'", "'other.urdf'", "no model 'other.urdf'; known: viperx-300"),
+    ],
+)
+def test_a_wrong_line_about_the_robot_is_named(cell, old, new, words):
+    path, _ = cell
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(CellError, match=words):
+        Station(CellConfig.load(path))
