@@ -7,6 +7,7 @@ import os
 import re
 import reprlib
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -178,7 +179,8 @@ class DatasetWriter:
     def _remove_unfinished(self, count: int) -> None:
         """Remove the files of the unfinished episode ``count``; files of any later episode are an error and stay."""
         unfinished = []
-        for file in (file for top in (*layout.EPISODE_FOLDERS, "meta") for file in inside(self.path, top).rglob("*")):
+        tops = (inside(self.path, top).rglob("*") for top in (*layout.EPISODE_FOLDERS, "meta"))
+        for file in (*self.path.glob(f".{layout.CARD_PATH}*{PART_SUFFIX}"), *chain.from_iterable(tops)):
             match = EPISODE_FILE.search(file.as_posix())
             episode = int(match[1]) * layout.FILES_PER_CHUNK + int(match[2]) if match else -1
             if episode > count:
