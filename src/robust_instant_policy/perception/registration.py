@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from robust_instant_policy.geometry import (
     FloatArray,
@@ -186,7 +187,7 @@ def _around(motions: FloatArray, source: Float32Array, target: Float32Array) -> 
     centre = source[:, :3].mean(axis=0)
     reach = np.linalg.norm(source[:, :3] - centre, axis=1).max() + max(COARSE_REACH_M)
     places = motions[:, :3, :3] @ centre + motions[:, :3, 3]
-    near = (np.linalg.norm(target[:, None, :3] - places, axis=2) < reach).any(axis=1)
+    near = (cdist(target[:, :3], places, "sqeuclidean") < reach**2).any(axis=1)
     return target[near] if near.any() else target[:1]
 
 
@@ -224,8 +225,10 @@ def icp(
         np.matmul(moved, linear, out=costs)
         np.add(costs, constant, out=costs)
         np.add(costs, np.einsum("cnx,cnx->cn", moved, moved)[..., None], out=costs)
-        to_target, to_source = costs.min(axis=2), costs.min(axis=1)
-        return costs.argmin(axis=2), costs.argmin(axis=1), to_target, to_source, to_source < OWN_REACH_M**2
+        targets, sources = costs.argmin(axis=2), costs.argmin(axis=1)
+        to_target = np.take_along_axis(costs, targets[..., None], axis=2)[..., 0]
+        to_source = np.take_along_axis(costs, sources[:, None], axis=1)[:, 0]
+        return targets, sources, to_target, to_source, to_source < OWN_REACH_M**2
 
     every_source, every_target = (
         np.broadcast_to(points, (len(motions), *points.shape)) for points in (source_xyz, target_xyz)
