@@ -214,3 +214,13 @@ def test_a_gripper_that_does_not_open_is_told(gate):
         gate.judge([state(arm, clock=float(step), finger_travel=0.0)])
     with pytest.raises(StoppedError, match="gripper is blocked"):
         gate.judge([state(arm, clock=-2.0, finger_travel=0.0)])
+
+
+def test_the_urdf_of_the_viperx_moves_its_tool_as_the_simulated_arm_does(cell):
+    from robust_instant_policy.tasks.aloha.robot import viperx
+
+    (arm,), _ = cell
+    low, high = arm.kinematics.joint_range.T
+    simulated = viperx("left").kinematics
+    for joints in np.random.default_rng(0).uniform(low, high, (20, len(low))):
+        np.testing.assert_allclose(arm.kinematics.tool_pose(joints), simulated.tool_pose(joints), atol=1e-4)
