@@ -188,7 +188,6 @@ SURE = Evidence(
     vote=1.0,
     distortion=0.5,
     prediction=0.008,
-    imprecision=0.005,
     novelty=0.4,
     displacement=0.004,
     precision=0.004,

@@ -72,7 +72,7 @@ def test_a_hand_turns_the_shorter_way_to_an_object_that_lies_the_other_way_round
 
 
 def test_an_unknown_level_is_told():
-    with pytest.raises(UnknownNameError, match="paper, hard"):
+    with pytest.raises(UnknownNameError, match="paper, noise, hard"):
         make_level("easy")
 
 

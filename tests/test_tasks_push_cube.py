@@ -153,7 +153,7 @@ class _Folder:
     num_episodes = property(lambda self: len(self.kept))
     last_seed = property(lambda self: self.kept[-1].seed if self.kept else None)
 
-    def add(self, demonstration, images=None):
+    def add(self, demonstration, images=None, grippers=None):
         self.kept.append(demonstration)
 
     def discard(self, seed):

@@ -21,8 +21,8 @@ from robust_instant_policy.geometry import FloatArray, robust_std
 from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
-    "constant": 3.85, "distortion": 1.67, "prediction": 1.88, "novelty": 1.08, "displacement": 1.34,
-    "precision": 1.03, "imprecision": 0.91, "doubts": 1.0, "warnings": 1.48,
+    "constant": 3.85, "distortion": 1.66, "prediction": 1.88, "novelty": 1.08, "displacement": 1.34,
+    "precision": 1.03, "doubts": 1.0, "warnings": 1.48,
 }  # fmt: skip
 UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
 
@@ -36,7 +36,6 @@ GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small mo
 # Up to these values evidence says nothing: sound scenes have them.
 GOOD_DISTORTION = 2.0
 GOOD_PREDICTION_M = 0.015
-GOOD_IMPRECISION_M = 0.006
 GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT = 0.015, 1.5  # or that many times the demonstrations' own
 GOOD_PRECISION_M = 0.025
 LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one scene
@@ -55,8 +54,7 @@ class Evidence:
     ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``vote`` in [0, 1] for the way to act
     that was followed, 0 where either of two may be meant (`Prompt.vote`); ``distortion`` of the distances between
     keypoints (see `distortion`); ``prediction``, metres, the error with which demonstrations predict each other at the
-    key step at which they do so best (see `prediction`), ``imprecision`` that at the gripper change at which they do so
-    worst (see `imprecision`); ``novelty``, how far the scene lies from the demonstrations
+    key step at which they do so best (see `prediction`); ``novelty``, how far the scene lies from the demonstrations
     (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and ``precision``, that
     of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording (`doubts`), other
     ``warnings``, and ``errors``.
@@ -66,7 +64,6 @@ class Evidence:
     vote: float
     distortion: float
     prediction: float
-    imprecision: float
     novelty: float
     displacement: float
     precision: float
@@ -91,7 +88,6 @@ class Evidence:
         found = {
             "distortion": self.distortion / GOOD_DISTORTION,
             "prediction": self.prediction / GOOD_PREDICTION_M,
-            "imprecision": self.imprecision / GOOD_IMPRECISION_M,
             "novelty": self.novelty,
             "displacement": self.displacement
             / max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision))),
@@ -124,13 +120,6 @@ def prediction(errors: FloatArray) -> float:
     """
     between = errors[:, 1:-1] if errors.shape[1] > 2 else errors
     return float(np.median(between, axis=0).min())
-
-
-def imprecision(errors: FloatArray) -> float:
-    """Metres, from the errors ``(I, S)`` of `leave_one_out`: the median over the demonstrations at the worst gripper
-    change; NaN without one. Where things are grasped and released, an error is often a failure."""
-    between = errors[:, 1:-1]
-    return float(np.median(between, axis=0).max()) if between.shape[1] else float("nan")
 
 
 def novelty(demonstrated: FloatArray, keypoints: FloatArray) -> float:
