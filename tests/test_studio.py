@@ -131,13 +131,16 @@ def studio(browser, workbench, tmp_path_factory) -> Iterator[Studio]:
 
 @needs_browser
 def test_the_arm_follows_the_handle_that_is_dragged(studio):
+    from robust_instant_policy.studio.stage import GIZMO_M
+
     before, picture = studio.tool(), studio.picture()
-    start = studio.pixel(before)
     mouse = studio.view.mouse
-    mouse.move(start[0] + 46, start[1])  # the arrow along x
+    grip = studio.pixel(before + np.array([0.93 * GIZMO_M, 0, 0]))  # on the arrow along x, beyond the rings
+    mouse.move(*grip)
+    time.sleep(0.5)  # the page finds what lies under the pointer when it draws
     mouse.down()
     for share in np.linspace(0, 1, 12):
-        mouse.move(start[0] + 46 + 60 * share, start[1])
+        mouse.move(grip[0] + 60 * share, grip[1])
         time.sleep(0.03)
     mouse.up()
     studio.banner("Recording")
