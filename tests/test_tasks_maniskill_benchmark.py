@@ -21,7 +21,7 @@ def test_a_task_of_maniskill_keeps_the_contract_of_tasks(pick_cube):
 
 
 def test_what_is_recorded_in_a_task_of_maniskill_solves_a_new_scene(pick_cube, tmp_path, capsys):
-    assert main(["record", "--task", "maniskill/PickCube", "--episodes", "3", "--out", str(tmp_path / "demos")]) == 0
+    assert main(["record", "--task", "maniskill/PickCube", "--episodes", "6", "--out", str(tmp_path / "demos")]) == 0
     policy = Neighbours().fit(load_demonstrations(tmp_path / "demos"))
     plan = policy.plan(pick_cube.reset(1000))
     execution = pick_cube.execute(plan.trajectory)

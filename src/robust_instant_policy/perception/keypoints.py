@@ -34,6 +34,7 @@ from robust_instant_policy.trajectory import Trajectory
 CORRESPONDENCES = ("registration", "nearest")
 SAME_SHAPE_FITNESS = 0.7  # from which keypoints need no registration of their own
 SCENERY_WEIGHT = 0.2  # of what never moves, beside what does
+HAND_SHOWN = 0.8  # share of the images from which on what lies at the start of the path is a hand
 NEIGHBOURHOOD_M = 0.04  # around a keypoint, for a registration of its own
 
 
@@ -101,6 +102,10 @@ class KeypointExtractor:
             return self._fit_nearest(observations, note)
         self._hands = Hands.at_start(trajectories) if trajectories else None
         views = [self._view(observation) for observation in observations]
+        shown = np.mean([view.shows_hand for view in views])
+        if 0 < shown < HAND_SHOWN:  # an arm that is parked in view is there in all images: these are things
+            self._hands = None
+            views = [self._view(observation) for observation in observations]
         notes = [note, *dict.fromkeys(line for view in views for line in view.notes)]
         if len(views) == 1:
             notes.append(

@@ -97,6 +97,11 @@ class View:
     least: int
     notes: tuple[str, ...]
 
+    @property
+    def shows_hand(self) -> bool:
+        """Whether something lies where a hand is at the start of a path."""
+        return bool((self.labels == HAND).any())
+
 
 @dataclass(frozen=True, eq=False)
 class Hands:
