@@ -25,7 +25,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,7 @@ from robust_instant_policy.policies import (
     context_of_keypoints,
     scene_of_keypoints,
 )
+from robust_instant_policy.policies.confidence import Evidence, plan_confidence
 from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.trajectory import Trajectory
 
@@ -404,9 +405,15 @@ def trust(rows: Sequence[Row]) -> list[str]:
 
 
 def judgements(rows: Sequence[Row]) -> tuple[np.ndarray, np.ndarray]:
-    """Confidence of each plan, and whether it is right."""
-    confidence = np.array([row.outcome.confidence for row in rows], dtype=float)
+    """Confidence of each plan, by the present coefficients, and whether it is right."""
+    confidence = np.array([confidence_of(row.outcome) for row in rows], dtype=float)
     return confidence, np.array([row.outcome.errors[0] <= WITHIN_M for row in rows], dtype=bool)
+
+
+def confidence_of(outcome: Outcome) -> float | None:
+    if not outcome.evidence:
+        return outcome.confidence
+    return plan_confidence(Evidence(**{one.name: outcome.evidence.get(one.name, np.nan) for one in fields(Evidence)}))
 
 
 def draw_reliability(rows: Sequence[Row], path: Path) -> None:
@@ -479,8 +486,12 @@ def main() -> None:
     latest = {row.case: row for row in read_rows(options.rows) if row.case.split == options.split}
     rows = list(latest.values())
     usual = [row for row in rows if row.case.condition == USUAL]
-    examined = {row.case.family for row in rows if row.case.condition != USUAL}
-    judged_rows = [row for row in rows if row.case.method in CONFIDENT and row.case.family in examined]
+    examined = {(row.case.family, row.case.noise_mm, row.case.demos) for row in rows if row.case.condition != USUAL}
+    judged_rows = [
+        row
+        for row in rows
+        if row.case.method in CONFIDENT and (row.case.family, row.case.noise_mm, row.case.demos) in examined
+    ]
     write(options.out / "tables" / "relations.md", table(usual))
     if judged_rows:
         write(options.out / "tables" / "relations_confidence.md", confidence_table(judged_rows))
