@@ -209,6 +209,7 @@ SURE = Evidence(
         {"precision": 0.04},
         {"doubts": 1},
         {"warnings": 2},
+        {"undecided": 1},
     ],
     ids=lambda worse: next(iter(worse)),
 )

@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike
 
 from robust_instant_policy.errors import InvalidValueError, PlanningError
 from robust_instant_policy.policies.confidence import (
-    UNKNOWN_NOTE,
     Evidence,
     distortion,
     doubts,
     novelty,
     plan_confidence,
     prediction,
+    undecided,
 )
 from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.policy import FrameUse, Plan, Stage, Stopwatch, Usage
@@ -103,8 +103,9 @@ def make_plan(
         doubts=doubts(findings),
         warnings=sum(finding.severity == "warning" for finding in findings) - doubts(findings),
         errors=len(errors(findings)),
+        undecided=undecided(findings),
     )
-    unknown = (UNKNOWN_NOTE,) if judged and not evidence.is_known else ()
+    unknown = evidence.unknown_notes if judged else ()
     beside = (evidence.displacement_note,) if evidence.features()["displacement"] else ()
     return Plan(
         trajectory=trajectory,

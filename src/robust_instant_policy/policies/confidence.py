@@ -4,8 +4,8 @@
 
 The features f_j are made from `Evidence` and are 0 where nothing speaks against the plan; the coefficients were fitted
 to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A
-plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene it is at
-most `UNKNOWN`.
+plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, or the
+checks could not decide whether images and paths belong together, it is at most `UNKNOWN`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,11 @@ UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
 UNKNOWN_NOTE = (
     "unchecked: the demonstrations cannot tell how well they predict a new scene (fewer than three, or all of one "
     f"scene); the confidence is at most {UNKNOWN}"
+)
+
+UNDECIDED_NOTE = (
+    "unchecked: it could not be decided whether images and paths of the demonstrations belong together; "
+    f"the confidence is at most {UNKNOWN}"
 )
 
 RECOGNISED = 0.8  # of the least confidence among demonstrations, from which on a scene counts as recognised
@@ -57,7 +62,7 @@ class Evidence:
     key step at which they do so best (see `prediction`); ``novelty``, how far the scene lies from the demonstrations
     (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and ``precision``, that
     of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording (`doubts`), other
-    ``warnings``, and ``errors``.
+    ``warnings``, and ``errors``, and how many warnings leave images and paths ``undecided`` (`undecided`).
     """
 
     agreement: float
@@ -70,11 +75,13 @@ class Evidence:
     doubts: int
     warnings: int
     errors: int
+    undecided: int = 0
 
     @property
-    def is_known(self) -> bool:
-        """Whether the demonstrations tell how well they predict a new scene."""
-        return bool(np.isfinite(self.prediction) and np.isfinite(self.novelty))
+    def unknown_notes(self) -> tuple[str, ...]:
+        """Why nothing is known of the plan's chance; empty where something is."""
+        predicted = np.isfinite(self.prediction) and np.isfinite(self.novelty)
+        return (*(() if predicted else (UNKNOWN_NOTE,)), *((UNDECIDED_NOTE,) if self.undecided > 0 else ()))
 
     @property
     def displacement_note(self) -> str:
@@ -104,12 +111,17 @@ def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEF
     score = coefficients["constant"] + sum(coefficients[name] * value for name, value in evidence.features().items())
     vote = evidence.vote if np.isfinite(evidence.vote) else 1.0
     probability = float(min(1.0, evidence.agreement / GOOD_AGREEMENT) * (1 + vote) / 2 / (1 + np.exp(-score)))
-    return probability if evidence.is_known else min(probability, UNKNOWN)
+    return min(probability, UNKNOWN) if evidence.unknown_notes else probability
 
 
 def doubts(findings: Sequence[Finding]) -> int:
     """How many ``findings`` are warnings that gripper states, grasps or rotations were recorded wrongly."""
     return sum(f.severity == "warning" and f.kind in RECORDING and bool(f.cause) for f in findings)
+
+
+def undecided(findings: Sequence[Finding]) -> int:
+    """How many ``findings`` are warnings that images and paths fit no better, or less well, than under a mistake."""
+    return sum(f.severity == "warning" and f.kind == "contact" for f in findings)
 
 
 def prediction(errors: FloatArray) -> float:
