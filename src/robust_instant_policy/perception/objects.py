@@ -13,7 +13,6 @@ from robust_instant_policy.geometry import FloatArray, invert_pose, project, tra
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 from robust_instant_policy.perception.parts import MIN_GAIN, candidate_parts, gain
 from robust_instant_policy.perception.registration import (
-    Candidates,
     Similarity,
     find_rivals,
     fit_shape,
@@ -21,6 +20,7 @@ from robust_instant_policy.perception.registration import (
     rotated,
     settle_turn,
     vote_for_motions,
+    within,
 )
 from robust_instant_policy.perception.view import MIN_OBJECT_M2, TARGET_M, UNRELATED, View, spread_out, subsample
 
@@ -51,15 +51,13 @@ MAX_SHARED = 0.3  # of the points that an object explains, with a better registe
 class Registration:
     """An object in an image: ``pose (4, 4)`` from the reference image's world to the image's, after the change of size
     ``shape (4, 4)`` (`fit_shape`), together ``motion (4, 4)``; ``fitness`` of its
-    points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones;
-    ``rivals``: other motions that explain the image, the pose's own score first.
+    points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones.
     """
 
     pose: FloatArray
     fitness: float
     similarity: float
     template: int
-    rivals: Candidates | None = None
     shape: FloatArray = field(default_factory=lambda: np.eye(4))
 
     @property
@@ -69,17 +67,6 @@ class Registration:
     @property
     def score(self) -> float:
         return (self.fitness + self.similarity) / 2
-
-    def certainty(self, points: FloatArray) -> FloatArray:
-        """Share ``(N,)``, in [0, 1], of the motions, weighted by how well they explain the image, that put ``points
-        (N, 3)`` of the reference image where this one does.
-        """
-        if self.rivals is None or not len(points):
-            return np.ones(len(points))
-        weights = np.exp(np.minimum(self.rivals.score - self.rivals.score[0], 0) / RIVAL_SCALE)
-        places = points @ np.swapaxes(self.rivals.motions[:, :3, :3], 1, 2) + self.rivals.motions[:, None, :3, 3]
-        same = np.linalg.norm(places - places[0], axis=2) < SAME_PLACE_M
-        return (weights[:, None] * same).sum(axis=0) / weights.sum()
 
 
 IN_REFERENCE = Registration(np.eye(4), 1.0, 1.0, 0)
@@ -320,26 +307,28 @@ def register_all(models: Sequence[Model], view: View) -> list[Registration]:
     found: dict[int, Registration] = {}
     for i in sorted(range(len(models)), key=lambda i: models[i].parent >= 0):  # parts come after their objects
         found[i] = _register_model(models[i], view, found)
-    tree = cKDTree(view.target[:, :3])
+    points = view.target[:, :3].astype(np.float64)
     claims: dict[int, IntArray] = {}  # of those that are settled
     for i in sorted(found, key=lambda i: -found[i].score):
         most = MAX_SHARED if models[i].parent < 0 else MAX_SHARED_BY_PART
-        claimed = _claim(tree, models[i], found[i])
+        claimed = _claim(points, models[i], found[i])
         if _shared(claimed, claims.values()) > most:
             contested = found[i]
             again = _register_model(models[i], view, found, _explained(models, found, list(claims)))
-            found[i] = max((_apart(tree, models[i], one, claims) for one in (contested, again)), key=lambda r: r.score)
+            found[i] = max(
+                (_apart(points, models[i], one, claims) for one in (contested, again)), key=lambda r: r.score
+            )
             # Or does what has the contested points belong somewhere else?
             holders = [k for k in claims if k != models[i].parent and _shared(claimed, [claims[k]]) > most]
             if len(holders) == 1:
                 holder, others = holders[0], {k: claims[k] for k in claims if k != holders[0]}
-                keeping = _apart(tree, models[i], contested, others)
+                keeping = _apart(points, models[i], contested, others)
                 without_both = _explained(models, found | {i: contested}, [*others, i])
                 moved = _register_model(models[holder], view, found, without_both)
                 if keeping.score + moved.score > found[i].score + found[holder].score:
                     found |= {i: keeping, holder: moved}
-                    claims[holder] = _claim(tree, models[holder], moved)
-        claims[i] = _claim(tree, models[i], found[i])
+                    claims[holder] = _claim(points, models[holder], moved)
+        claims[i] = _claim(points, models[i], found[i])
     result = [found[i] for i in range(len(models))]
     if not any(model.varies for model in models):
         return result
@@ -355,11 +344,10 @@ def _explained(
     return np.concatenate([np.zeros((0, 3)), *moved])
 
 
-def _claim(tree: cKDTree, model: Model, found: Registration) -> IntArray:
-    """Numbers of the points in ``tree`` that an object explains."""
+def _claim(points: FloatArray, model: Model, found: Registration) -> IntArray:
+    """Numbers of the ``points (N, 3)`` of an image that an object explains."""
     moved = transform_points(found.motion, model.templates[found.template].surface)
-    near = tree.query_ball_point(moved, CLAIM_M)
-    return np.unique(np.concatenate([np.asarray(one, dtype=np.intp) for one in near]))
+    return np.flatnonzero(within(points, moved, CLAIM_M))
 
 
 def _shared(claimed: IntArray, claims: Iterable[IntArray]) -> float:
@@ -369,9 +357,9 @@ def _shared(claimed: IntArray, claims: Iterable[IntArray]) -> float:
     )
 
 
-def _apart(tree: cKDTree, model: Model, found: Registration, claims: Mapping[int, IntArray]) -> Registration:
+def _apart(points: FloatArray, model: Model, found: Registration, claims: Mapping[int, IntArray]) -> Registration:
     """``found``, whose fitness counts only for points that are in no other object's ``claims``."""
-    return replace(found, fitness=found.fitness * (1 - _shared(_claim(tree, model, found), claims.values())))
+    return replace(found, fitness=found.fitness * (1 - _shared(_claim(points, model, found), claims.values())))
 
 
 def _another_template(view: View, found: Registration, templates: Sequence[Template], seed: int) -> list[Template]:
@@ -419,12 +407,11 @@ def register(
     """
     target, free = view.target, np.arange(len(view.cell_points))
     if taken is not None and len(taken):
-        others = cKDTree(taken)
-        target = target[others.query(target[:, :3], distance_upper_bound=CLAIM_M)[0] > CLAIM_M]
-        free = np.flatnonzero(others.query(view.cell_points, distance_upper_bound=CLAIM_M)[0] > CLAIM_M)
+        target = target[~within(target[:, :3], taken, CLAIM_M)]
+        free = np.flatnonzero(~within(view.cell_points, taken, CLAIM_M))
         if len(target) < MIN_TARGET_POINTS or not len(free):
             return Registration(np.eye(4), 0.0, 0.0, 0)
-    similar = [t.view.descriptors.similarities(t.cells, view.descriptors, view.cells) for t in templates]
+    similar = _similarities(templates, view)
     with_foreground = [table[:, free] for table in similar]
     points = np.concatenate([template.points for template in templates])
     motions = np.zeros((0, 4, 4))
@@ -440,8 +427,24 @@ def register(
     source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
     candidates = refine(motions, source, target, similarity)
     pose = settle_turn(candidates.motions[0], source, target, similarity)
-    rivals = find_rivals(pose, source, target, similarity)
-    return Registration(pose, float(candidates.fitness[0]), float(candidates.similarity[0]), index, rivals)
+    return Registration(pose, float(candidates.fitness[0]), float(candidates.similarity[0]), index)
+
+
+def certainty(model: Model, found: Registration, view: View, points: FloatArray) -> FloatArray:
+    """Share ``(N,)``, in [0, 1], of the motions, weighted by how well they explain ``view``, that put ``points (N, 3)`` of
+    the reference image where ``found`` does.
+    """
+    similarity = _similarity(model.templates, view, _similarities(model.templates, view))
+    rivals = find_rivals(found.pose, model.templates[found.template].xyzrgb, view.target, similarity)
+    weights = np.exp(np.minimum(rivals.score - rivals.score[0], 0) / RIVAL_SCALE)
+    places = points @ np.swapaxes(rivals.motions[:, :3, :3], 1, 2) + rivals.motions[:, None, :3, 3]
+    same = np.linalg.norm(places - places[0], axis=2) < SAME_PLACE_M
+    return (weights[:, None] * same).sum(axis=0) / weights.sum()
+
+
+def _similarities(templates: Sequence[Template], view: View) -> list[Float32Array]:
+    """Of the cells of each of ``templates`` and those of ``view``."""
+    return [one.view.descriptors.similarities(one.cells, view.descriptors, view.cells) for one in templates]
 
 
 def _similarity(templates: Sequence[Template], view: View, similar: Sequence[Float32Array]) -> Similarity:
