@@ -431,8 +431,8 @@ def register(
 
 
 def certainty(model: Model, found: Registration, view: View, points: FloatArray) -> FloatArray:
-    """Share ``(N,)``, in [0, 1], of the motions, weighted by how well they explain ``view``, that put ``points (N, 3)`` of
-    the reference image where ``found`` does.
+    """Share ``(N,)``, in [0, 1], of the motions, weighted by how well they explain ``view``, that put ``points (N, 3)``
+    of the reference image where ``found`` does.
     """
     similarity = _similarity(model.templates, view, _similarities(model.templates, view))
     rivals = find_rivals(found.pose, model.templates[found.template].xyzrgb, view.target, similarity)

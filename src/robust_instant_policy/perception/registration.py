@@ -43,8 +43,7 @@ COARSE_POINTS = 60
 FINALISTS = 3
 SAME_SHIFT_M, SAME_TURN_RAD = 0.005, np.deg2rad(5.0)  # between motions that ICP brings to one
 COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)  # kernel width in each iteration
-FINE_REACH_M = (0.02, 0.015, 0.015)
-FINEST_REACH_M = (0.01, 0.01)
+FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
 LOCAL_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
 MIN_WEIGHT = np.float32(1e-9)  # keeps the weights' sum above zero
 # Symmetry and rivals.
@@ -126,18 +125,14 @@ def refine(motions: FloatArray, source: Float32Array, target: Float32Array, simi
     starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
     starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M)
     leading = _distinct(starts, centre, np.argsort(-fitness - similarity(starts), kind="stable"))[:FINALISTS]
-    refined = [_refine_one(start, source, target) for start in starts[leading][:, None]]
+    refined = [
+        icp(start, source, _near(start, source, _around(start, source, target)), FINE_REACH_M)
+        for start in starts[leading][:, None]
+    ]
     finalists, fitness = (np.concatenate(parts) for parts in zip(*refined, strict=True))
     similarities = similarity(finalists)
     order = np.argsort(-fitness - similarities, kind="stable")
     return Candidates(finalists[order], fitness[order], similarities[order])
-
-
-def _refine_one(motion: FloatArray, source: Float32Array, target: Float32Array) -> tuple[FloatArray, FloatArray]:
-    """``motion (1, 4, 4)`` after ICP with every second, then with all points, and its fitness ``(1,)``."""
-    near = _near(motion, source, _around(motion, source, target))
-    motion = icp(motion, source[::2], near[::2], FINE_REACH_M)[0]
-    return icp(motion, source, near, FINEST_REACH_M)
 
 
 def settle_turn(motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> FloatArray:
