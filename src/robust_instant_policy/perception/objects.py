@@ -425,8 +425,8 @@ def register(
             motions = motions[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
     index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
     source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
-    candidates = refine(motions, source, target, similarity)
-    pose = settle_turn(candidates.motions[0], source, target, similarity)
+    candidates = refine(motions, source, target, similarity, view.hides)
+    pose = settle_turn(candidates.motions[0], source, target, similarity, view.hides)
     return Registration(pose, float(candidates.fitness[0]), float(candidates.similarity[0]), index)
 
 
@@ -435,7 +435,7 @@ def certainty(model: Model, found: Registration, view: View, points: FloatArray)
     of the reference image where ``found`` does.
     """
     similarity = _similarity(model.templates, view, _similarities(model.templates, view))
-    rivals = find_rivals(found.pose, model.templates[found.template].xyzrgb, view.target, similarity)
+    rivals = find_rivals(found.pose, model.templates[found.template].xyzrgb, view.target, similarity, view.hides)
     weights = np.exp(np.minimum(rivals.score - rivals.score[0], 0) / RIVAL_SCALE)
     places = points @ np.swapaxes(rivals.motions[:, :3, :3], 1, 2) + rivals.motions[:, None, :3, 3]
     same = np.linalg.norm(places - places[0], axis=2) < SAME_PLACE_M

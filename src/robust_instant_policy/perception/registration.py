@@ -45,6 +45,7 @@ SAME_SHIFT_M, SAME_TURN_RAD = 0.005, np.deg2rad(5.0)  # between motions that ICP
 COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)  # kernel width in each iteration
 FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
 LOCAL_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
+HIDDEN_WEIGHT = 0.5  # of a point that something hides, which counts as one without a match, beside one that is seen
 MIN_WEIGHT = np.float32(1e-9)  # keeps the weights' sum above zero
 # Symmetry and rivals.
 SMALL_TURNS = np.deg2rad(np.arange(-20.0, 25.0, 5.0))  # the middle one is none
@@ -63,6 +64,7 @@ MIN_EXTENT_M = 0.01  # flatter things are not stretched
 MAX_STRETCH = 1.4
 
 Similarity = Callable[[FloatArray], FloatArray]
+Hidden = Callable[[FloatArray], NDArray[np.bool_]]
 
 
 def vote_for_motions(source: FloatArray, target: FloatArray, similarities: Float32Array) -> FloatArray:
@@ -115,18 +117,21 @@ class Candidates:
         return (self.fitness + self.similarity) / 2
 
 
-def refine(motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> Candidates:
+def refine(
+    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+) -> Candidates:
     """The best candidates after ICP from ``motions (P, 4, 4)``.
 
     ``source (N, 6)`` and ``target (M, 6)`` are XYZRGB points; ``similarity`` is that of the descriptors under each of
-    several motions. A subset of the points selects `FINALISTS`, all points order them.
+    several motions, ``hidden`` tells which places ``(..., 3)`` of points something hides. A subset of the points
+    selects `FINALISTS`, all points order them.
     """
     centre = source[:, :3].mean(axis=0)
     starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
-    starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M)
+    starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M, hidden)
     leading = _distinct(starts, centre, np.argsort(-fitness - similarity(starts), kind="stable"))[:FINALISTS]
     refined = [
-        icp(start, source, _near(start, source, _around(start, source, target)), FINE_REACH_M)
+        icp(start, source, _near(start, source, _around(start, source, target)), FINE_REACH_M, hidden)
         for start in starts[leading][:, None]
     ]
     finalists, fitness = (np.concatenate(parts) for parts in zip(*refined, strict=True))
@@ -135,12 +140,14 @@ def refine(motions: FloatArray, source: Float32Array, target: Float32Array, simi
     return Candidates(finalists[order], fitness[order], similarities[order])
 
 
-def settle_turn(motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> FloatArray:
+def settle_turn(
+    motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+) -> FloatArray:
     """``motion (4, 4)``, turned to the descriptors' mean rotation if points do not determine it, as for a disc."""
     centre = source[:, :3].mean(axis=0)
     alternatives = rotated(motion, centre, SMALL_TURNS)
     target = _around(motion[None], source, target)
-    fitness = icp(alternatives, *_coarse(source, target), ())[1]
+    fitness = icp(alternatives, *_coarse(source, target), (), hidden)[1]
     if fitness.min() <= fitness[len(alternatives) // 2] - MAX_SYMMETRY_LOSS:
         return motion
     likelihood = similarity(alternatives)
@@ -148,16 +155,18 @@ def settle_turn(motion: FloatArray, source: Float32Array, target: Float32Array, 
     return rotated(motion, centre, np.atleast_1d(share @ SMALL_TURNS / share.sum()))[0]
 
 
-def find_rivals(motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> Candidates:
+def find_rivals(
+    motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+) -> Candidates:
     """``motion (4, 4)`` itself, and that turned by `LARGE_TURNS` or slid by `SLIDES_M`, measured with a subset."""
     centre = source[:, :3].mean(axis=0)
     turned = rotated(motion, centre, LARGE_TURNS)
     slid = np.repeat(motion[None], len(SLIDES_M), axis=0)
     slid[:, :3, 3] += SLIDES_M
     coarse = _coarse(source, _around(motion[None], source, target))
-    turned = icp(turned, *coarse, RIVAL_REACH_M)[0]
+    turned = icp(turned, *coarse, RIVAL_REACH_M, hidden)[0]
     motions = np.concatenate([motion[None], turned, slid])
-    return Candidates(motions, icp(motions, *coarse, ())[1], similarity(motions))
+    return Candidates(motions, icp(motions, *coarse, (), hidden)[1], similarity(motions))
 
 
 def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
@@ -239,12 +248,13 @@ def rotated(motion: FloatArray, centre: FloatArray, angles: FloatArray) -> Float
 
 
 def icp(
-    motions: FloatArray, source: Float32Array, target: Float32Array, reaches: tuple[float, ...]
+    motions: FloatArray, source: Float32Array, target: Float32Array, reaches: tuple[float, ...], hidden: Hidden
 ) -> tuple[FloatArray, FloatArray]:
     """``motions (C, 4, 4)`` after one ICP iteration for each of ``reaches`` (kernel widths, metres), and their fitness.
 
     Matches go both ways: an object shifted along itself still covers most of its image points, and only those left
-    uncovered show the error. The fitness in [0, 1] is the geometric mean of both ways.
+    uncovered show the error. The fitness in [0, 1] is the geometric mean of both ways. Points that are ``hidden`` count
+    less.
     """
     source_xyz, target_xyz = (points[:, :3].astype(np.float64) for points in (source, target))
     colours = colour_costs(source, target)
@@ -288,7 +298,9 @@ def icp(
         )
     _, _, to_target, to_source, own = match(motions)
     covered = (own * np.exp(-to_source / RESIDUAL_M**2)).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
-    return motions, np.sqrt(np.exp(-to_target / RESIDUAL_M**2).mean(axis=1) * covered)
+    seen = ~hidden(source_xyz @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3])
+    matched = (seen * np.exp(-to_target / RESIDUAL_M**2)).sum(axis=1) / np.where(seen, 1, HIDDEN_WEIGHT).sum(axis=1)
+    return motions, np.sqrt(matched * covered)
 
 
 def colour_costs(source: Float32Array, target: Float32Array) -> Float32Array:
