@@ -205,10 +205,12 @@ def _shapes(models: Sequence[Model], found: Sequence[Registration], view: View) 
         return []
     points = view.target[:, :3].astype(np.float64)
     owner = _owners(models, [one.pose for one in found], points)
-    return [
-        fit_shape(one.pose, model.points, points[owner == i])
-        for i, (model, one) in enumerate(zip(models, found, strict=True))
-    ]
+    shapes = []
+    for i, (model, one) in enumerate(zip(models, found, strict=True)):
+        moved = transform_points(one.pose, model.points)
+        # What something hides has not changed.
+        shapes.append(fit_shape(one.pose, model.points, np.concatenate([points[owner == i], moved[view.hides(moved)]])))
+    return shapes
 
 
 def _owners(models: Sequence[Model], motions: Sequence[FloatArray], points: FloatArray) -> IntArray:
