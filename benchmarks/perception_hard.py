@@ -1,6 +1,6 @@
-"""Keypoints in the hard scenes of the simulated tasks, against the simulator's truth, and their confidence.
+"""Keypoints and their confidence in the hard scenes of the simulated tasks, against the simulator's truth.
 
-Demonstrations and scenes are those of `rip eval --level hard`; a scene is measured once and kept as a row, so that a run
+Demonstrations and scenes are those of `rip eval --level hard`; a scene is measured once and kept as a row, so a run
 that was stopped goes on. Delete the rows to measure anew.
 """
 

@@ -51,15 +51,13 @@ MAX_SHARED = 0.3  # of the points that an object explains, with a better registe
 class Registration:
     """An object in an image: ``pose (4, 4)`` from the reference image's world to the image's, after the change of size
     ``shape (4, 4)`` (`fit_shape`), together ``motion (4, 4)``; ``fitness`` of its
-    points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones;
-    ``runner_up``: score of the best motion that puts it elsewhere.
+    points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones.
     """
 
     pose: FloatArray
     fitness: float
     similarity: float
     template: int
-    runner_up: float = 0.0
     shape: FloatArray = field(default_factory=lambda: np.eye(4))
 
     @property
@@ -431,10 +429,7 @@ def register(
     source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
     candidates = refine(motions, source, target, similarity, view.hides)
     pose = settle_turn(candidates.motions[0], source, target, similarity, view.hides)
-    places = candidates.motions[:, :3, :3] @ points.mean(axis=0) + candidates.motions[:, :3, 3]
-    elsewhere = np.linalg.norm(places - places[0], axis=1) > SAME_PLACE_M
-    runner_up = float(candidates.score[elsewhere].max(initial=0.0))
-    return Registration(pose, float(candidates.fitness[0]), float(candidates.similarity[0]), index, runner_up)
+    return Registration(pose, float(candidates.fitness[0]), float(candidates.similarity[0]), index)
 
 
 def certainty(model: Model, found: Registration, view: View, points: FloatArray) -> FloatArray:
