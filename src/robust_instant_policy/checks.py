@@ -50,3 +50,8 @@ def _is_number(value: object, kind: type) -> bool:
 
 def _got(value: object) -> str:
     return f"got {value!r} ({type(value).__name__})"
+
+
+def is_trusted(confidence: float | None, least: float) -> bool:
+    """Whether a plan may be executed: it has a ``confidence`` above 0 of at least ``least``."""
+    return confidence is not None and confidence > 0 and confidence >= least
