@@ -586,6 +586,26 @@ def test_recordings_are_imported_from_the_command_line(tmp_path, capsys):
         np.testing.assert_allclose(demo.trajectory.actions, original.trajectory.actions, atol=1e-5)
 
 
+def test_an_import_without_a_folder_goes_into_one_named_after_the_task(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "here" / "there"
+    folder.mkdir(parents=True)
+    monkeypatch.chdir(folder)
+    path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector)
+    rig = {"triangle": {"length": 0.1, "opening": 0.08}, "gripper": {"open": 100, "closed": 0}}
+    seen = observation(0)
+    rig |= {"intrinsics": seen.intrinsics.tolist(), "camera_pose": seen.camera_pose.tolist(), "tool": TOOL.tolist()}
+    rig |= {"depth_key": "observation.depth", "depth_unit_m": 0.001}
+    Path("rig.json").write_text(json.dumps(rig))
+    for task, name in (("metaworld/reach", "metaworld-reach"), ("../../push", "..-..-push")):
+        assert main(["import", str(path), "--rig", "rig.json", "--task", task]) == 0
+        assert len(load_demonstrations(Path("data") / name, task)) == 2
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["here", "theirs"]
+    for task in ("", "..", "."):
+        with pytest.raises(SystemExit):
+            main(["import", str(path), "--rig", "rig.json", "--task", task])
+        assert "must be a name" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
