@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from robust_instant_policy.datasets import layout
+from robust_instant_policy.datasets import coded_depth, layout
 from robust_instant_policy.datasets.folder import Folder, open_folder
 from robust_instant_policy.datasets.images import decode_image
 from robust_instant_policy.datasets.importers.depth import PIXEL_FORMAT, dequantised, is_depth, unit_of
@@ -189,23 +189,24 @@ def _depth_stream(features: Mapping[str, Any], camera: str | None) -> str | None
 def _first_depth(folder: Folder, episode: int, key: str, unit_m: float | None) -> NDArray[np.float32]:
     """Depth ``(H, W)``, or ``(H·W,)`` where it is stored so, metres, of the first frame."""
     feature = folder.info["features"][key]
-    if key in folder.video_keys:
-        if not is_depth(feature):
-            raise DatasetError(
-                f"{folder.root}: {key} is a colour video, which holds no depth; record depth as a depth stream of "
-                "lerobot 0.6, or as a feature with one number a pixel"
-            )
+    if key in folder.video_keys and is_depth(feature):
         codes = next(folder.frames(episode, key, PIXEL_FORMAT))
         return dequantised(codes, feature, f"{folder.root}: {key}")
+    image = _first_image(folder, episode, key)
+    if image.ndim == 3 and image.shape[2] == 3:
+        coded = coded_depth.decode(image)
+        if coded is None:
+            raise DatasetError(
+                f"{folder.root}: {key} is a colour image, which holds no depth; record depth as a depth stream of "
+                "lerobot 0.6, as a feature with one number a pixel, or coded as rip_twin does with --robot.depth=coded"
+            )
+        return coded
     unit = unit_m or unit_of(feature)
     if unit is None:
         raise DatasetError(
             f"{folder.root} does not say the unit of {key!r}; give depth_unit_m, metres per step, in the rig"
         )
-    depth = _first_image(folder, episode, key)
-    if depth.ndim == 3 and depth.shape[2] == 3 and depth.dtype == np.uint8 and not depth[..., 2].any():
-        depth = 256.0 * depth[..., 0] + depth[..., 1]  # high and low byte, as the plugin rip_twin packs them
-    depth = depth.astype(np.float32) * np.float32(unit)
+    depth = image.astype(np.float32) * np.float32(unit)
     return depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
 
 
