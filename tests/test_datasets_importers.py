@@ -511,6 +511,14 @@ def test_poses_without_names_are_read_as_is_usual_for_their_feature(tmp_path, ke
         np.testing.assert_allclose(demonstration_poses(demo), expected, atol=1e-5)
 
 
+def test_a_pose_without_names_may_end_with_the_gripper(tmp_path):
+    path = lerobot_folder(tmp_path / "theirs", None, layout(xyzw), key="observation.ee_pose")
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
+        original = demonstration(seed, steps=len(demo.trajectory))
+        np.testing.assert_allclose(demonstration_poses(demo), tilted(original), atol=1e-5)
+        np.testing.assert_array_equal(demo.trajectory.gripper_state, original.trajectory.gripper_state)
+
+
 def test_quaternions_of_an_order_that_cannot_be_told_are_not_guessed(tmp_path):
     path = lerobot_folder(tmp_path / "theirs", None, layout(wxyz, gripper=False), key="observation.ee_pose")
     message = refusal(import_demonstrations, path, TASK, known_rig())

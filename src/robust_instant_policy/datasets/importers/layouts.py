@@ -127,7 +127,7 @@ def unnamed_columns(size: int, rotation: str | None) -> Columns | None:
     """A vector of numbers without names as a pose; None where the kind of rotation is not known."""
     if rotation is not None:
         return Columns("", (0, 1, 2), _in_xyzw(tuple(range(3, 3 + ROTATIONS[rotation])), rotation), rotation)
-    return Columns("", (0, 1, 2), (3, 4, 5, 6), "") if size == 7 else None
+    return Columns("", (0, 1, 2), (3, 4, 5, 6), "") if size in (7, 8) else None  # 8: with the gripper
 
 
 def _axis(name: str) -> str | None:

@@ -23,7 +23,6 @@ from robust_instant_policy.datasets.importers.hdf5 import choose_camera
 from robust_instant_policy.datasets.importers.joints import JointModel
 from robust_instant_policy.datasets.importers.layouts import (
     ARMS,
-    ROTATIONS,
     Columns,
     arm_of,
     axis_names,
@@ -157,8 +156,9 @@ def _gripper(folder: Folder, episode: int, rig: Rig) -> FloatArray | None:
         columns = gripper_columns(names)
         if not columns and is_gripper(key) and size == 1 and not more:
             columns, names = {arm_of(key): 0}, []
-        if not columns and key == rig.pose_key and rig.rotation and size == 4 + ROTATIONS[rig.rotation]:
-            columns = {arm_of(key): size - 1}  # one number more than those of the pose
+        for pose in () if columns else _unnamed(folder, key, names, rig):
+            if size == len(pose.position) + len(pose.turns) + 1:  # one number more than those of the pose
+                columns = {arm_of(key): size - 1}
         for arm, column in columns.items():
             if arm not in found:
                 found[arm] = _matrix(folder, episode, key, names)[:, column]
