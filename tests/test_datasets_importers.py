@@ -206,6 +206,18 @@ def test_robomimic_files_of_two_arms_have_the_gripper_of_each(tmp_path):
         np.testing.assert_array_equal(demo.trajectory.gripper_state[:, 1:], 1 - original.gripper_state)
 
 
+@pytest.mark.parametrize("shape", [(20, 48, 64), (20, 48 * 64)], ids=["without a channel", "flat"])
+def test_robomimic_depth_may_have_other_dimensions(tmp_path, shape):
+    path = robomimic_file(tmp_path / "lift.hdf5")
+    with h5py.File(path, "r+") as file:
+        for group in file["data"].values():
+            depth = group["obs/agentview_depth"][()]
+            del group["obs/agentview_depth"]
+            group["obs/agentview_depth"] = depth.reshape(shape)
+    (first, *_) = import_demonstrations(path, TASK, Rig(TRIANGLE))
+    np.testing.assert_array_equal(first.observation.depth, observation(0).depth)
+
+
 def test_two_robomimic_files_make_one_folder_and_none_of_their_episodes_is_lost_or_doubled(tmp_path):
     first, second = (robomimic_file(tmp_path / name) for name in ("lift.hdf5", "more.hdf5"))
     out = tmp_path / "lift"

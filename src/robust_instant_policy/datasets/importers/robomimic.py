@@ -58,9 +58,10 @@ def _read_episode(
 ) -> SourceEpisode:
     cameras = [key.removesuffix("_image") for key in members(group, "obs") if key.endswith("_image")]
     chosen = choose_camera(path, [one for one in cameras if HAND_CAMERA not in one], camera)
-    images, depth = (read(group, f"obs/{chosen}_{kind}", ndim=4) for kind in ("image", "depth"))
+    images = read(group, f"obs/{chosen}_image", 4)
+    depth = read(group, f"obs/{chosen}_depth", 4, 3, 2)  # robomimic writes (T, H, W, 1)
     calibration = nested(read_json_attribute(group, "camera_info"), str(chosen))
-    where, actions = f"{path} ({excerpt(name)})", read(group, "actions", ndim=2)
+    where, actions = f"{path} ({excerpt(name)})", read(group, "actions", 2)
     arms = [poses for arm in range(MAX_ARMS) if (poses := _poses(where, group, arm)) is not None]
     grippers = None
     if actions is not None:  # those of each arm end with its gripper
@@ -75,7 +76,7 @@ def _read_episode(
     return SourceEpisode(
         name=f"{path.name} ({excerpt(name)})",
         rgb=None if images is None else images[0],
-        depth=None if depth is None else depth[0, ..., 0].astype(np.float32),
+        depth=None if depth is None else depth[0].astype(np.float32).squeeze(),
         intrinsics=calibration.get("intrinsics"),
         camera_pose=calibration.get("extrinsics"),
         poses=np.stack(arms, axis=1) if arms else None,
@@ -91,7 +92,7 @@ def _read_episode(
 
 def _poses(where: str, group: Any, arm: int) -> FloatArray | None:
     """Poses ``(T, 4, 4)`` of one arm; None where they are missing."""
-    position, quaternion = (read(group, f"obs/robot{arm}_eef_{kind}", ndim=2) for kind in ("pos", "quat"))
+    position, quaternion = (read(group, f"obs/robot{arm}_eef_{kind}", 2) for kind in ("pos", "quat"))
     if position is None or quaternion is None:
         return None
     if position.shape != (len(quaternion), 3) or quaternion.shape[1] != 4:

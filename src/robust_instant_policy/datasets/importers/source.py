@@ -127,9 +127,10 @@ class SourceEpisode:
         ):
             raise DatasetError(f"{self.name} lacks {'; '.join(self._missing())}{self.advice and '. ' + self.advice}")
         if self.poses.shape[:-2] != self.gripper_values.shape:
+            poses, grippers = self.poses.shape[:-2], self.gripper_values.shape
             raise DatasetError(
-                f"{self.name} is damaged: it has poses {self.poses.shape[:-2]} and gripper values "
-                f"{self.gripper_values.shape} of steps and arms"
+                f"{self.name} has poses of {poses[0]} steps and {(*poses, 1)[1]} arms, but gripper values of "
+                f"{grippers[0]} steps and {(*grippers, 1)[1]} arms"
             )
         if not np.isfinite(self.gripper_values).all():
             raise DatasetError(f"{self.name} is damaged: its gripper values are not all finite")
