@@ -29,7 +29,14 @@ from robust_instant_policy.reporting.run import (
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.client import Emulation, devices_of
-from robust_instant_policy.robots.execution import is_parked, observe, park, require_trust
+from robust_instant_policy.robots.execution import (
+    has_open_grippers,
+    is_parked,
+    observe,
+    open_grippers,
+    park,
+    require_trust,
+)
 from robust_instant_policy.robots.signals import stop_on_signals
 from robust_instant_policy.robots.station import Played, Station
 
@@ -87,6 +94,7 @@ class _Run:
         with station:
             self._park(station)
             motion, record = self._prepare(station)
+            self._open_grippers(station)
             seconds = len(motion.joints) / station.rate_hz
             self._confirm(f"execute {seconds:.0f} s of motion at {100 * self._speed:.0f}% of the usual speed?")
             with self._screen.stage("execution"), stop_on_signals() as stop:
@@ -97,7 +105,7 @@ class _Run:
             self._report(record, success, "; ".join([outcome, *grasps]))
             if played.stopped:
                 raise StoppedError(f"{played.stopped}; the arms hold their position")
-        if success is not False:
+        if success:  # not where nobody judged it
             write_whole(self._done, b"")
 
     def _park(self, station: Station) -> None:
@@ -108,6 +116,16 @@ class _Run:
             played = park(station, stop, min(self._speed, self._config.first_run_speed))
         if played.stopped:
             raise StoppedError(f"{played.stopped}; the arms hold their position")
+
+    def _open_grippers(self, station: Station) -> None:
+        """A plan begins with open grippers; the person takes what is still held."""
+        if has_open_grippers(station):
+            return
+        self._confirm("a gripper is closed: hold what it has; open it?")
+        with self._screen.stage("open grippers"), stop_on_signals() as stop:
+            open_grippers(station, stop)
+        if stop.reason:
+            raise StoppedError(f"stopped ({stop.reason}); the arms hold their position")
 
     def _prepare(self, station: Station) -> tuple[Motion, RunRecord]:
         """A checked motion, and what is known of the run; the page shows the plan already."""

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from robust_instant_policy.geometry import FloatArray
 
+GRIP_LOAD = 0.5  # share of its force limit from which a gripper holds something
+OPEN = 0.9  # share of its travel from which a gripper is open
+
 
 @dataclass(frozen=True, eq=False)
 class Command:
@@ -31,3 +34,13 @@ class ArmState:
     grip_load: float
     clock: float
     faults: tuple[str, ...] = ()
+
+
+def is_open(state: ArmState, travel: float) -> bool:
+    """Whether fingers with the full ``travel``, metres, are open."""
+    return state.finger_travel > OPEN * travel
+
+
+def is_gripping(state: ArmState, travel: float) -> bool:
+    """Whether fingers with the full ``travel``, metres, press on something between them."""
+    return state.grip_load >= GRIP_LOAD and not is_open(state, travel)

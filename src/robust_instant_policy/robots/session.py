@@ -8,17 +8,15 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import count as count_from
 from pathlib import Path
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, StoppedError, UnreachableError
 from robust_instant_policy.files import read_regular, write_whole
-from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.camera import Camera
 from robust_instant_policy.robots.cell import CellConfig
-from robust_instant_policy.robots.execution import is_parked, observe, park
+from robust_instant_policy.robots.execution import has_open_grippers, is_parked, observe, open_grippers, park
 from robust_instant_policy.robots.journal import Episode, Journal
 from robust_instant_policy.robots.leader import Leader
 from robust_instant_policy.robots.operator import ENTER, Operator
@@ -27,8 +25,6 @@ from robust_instant_policy.robots.station import Station
 from robust_instant_policy.sanity import check_demonstrations
 
 PREVIEW = "p"
-OPEN = 0.9  # share of its travel from which a gripper is open
-OPENING_S = 1.0
 LATE_S = 5e-3  # deviation of a step that 95% of the steps must keep within
 
 
@@ -147,20 +143,12 @@ class Session:
 
     def _open_grippers(self) -> None:
         """A demonstration begins with open grippers; the person takes what is still held."""
-        station, operator = self.station, self.operator
-        travels = [arm.finger_travel for arm in station.arms]
-        if all(state.finger_travel > OPEN * travel for state, travel in zip(station.states(), travels, strict=True)):
+        operator = self.operator
+        if has_open_grippers(self.station):
             return
         if operator.ask("a gripper is closed: hold what it has; Enter opens it", ENTER) != ENTER:
             raise StoppedError(f"{operator.stop.reason}; the arms hold their position")
-        steps = count_from()
-
-        def opening(states: Sequence[ArmState]) -> list[Command] | None:
-            if next(steps) > OPENING_S * station.rate_hz or operator.stop.reason:
-                return None
-            return [Command(told.joints, travel) for told, travel in zip(station.gate.last, travels, strict=True)]
-
-        station.lead(opening)
+        open_grippers(self.station, operator.stop)
 
     def _park(self) -> None:
         """Move the arms to their park poses; where the way is refused, the person leads them nearer."""
