@@ -142,3 +142,17 @@ def test_a_scene_that_stretches_what_was_shown_is_outside():
     assert prompt.outside(far) > 0.5
     assert prompt.scene_notes(keypoints[0]) == ()
     assert any("extrapolation" in note for note in prompt.scene_notes(far))
+
+
+def test_changes_of_frame_side_by_side_correct_a_jump_once():
+    from robust_instant_policy.context.joins import joined
+
+    hands = np.tile([[0.0, 0.0, 0.1], [0.0, 0.04, 0.0], [0.0, -0.04, 0.0]], (12, 1, 1))
+    hands[:, :, 0] += 0.01 * np.arange(12)[:, None]
+    hands[5:, :, 1] += 0.05
+    still = np.zeros((11, 2))
+    once = joined(hands, np.full(12, 0.03), {0, 11}, {5}, still)
+    for changes in ({5, 6}, {4, 5, 6}):
+        np.testing.assert_allclose(joined(hands, np.full(12, 0.03), {0, 11}, changes, still), once, atol=1e-9)
+    assert np.diff(once[:, 0, 1]).max() < 0.03
+    np.testing.assert_allclose(joined(hands, np.full(12, 0.03), {0, 11}, (), still), hands, atol=1e-9)

@@ -91,6 +91,20 @@ def test_demonstrations_whose_geometry_is_wrong_are_refused_and_the_mistake_is_n
         check_demonstrations(FAULTS[fault].demonstrations(demonstrations)).raise_if_wrong()
 
 
+def test_wrong_readings_below_the_table_are_no_hole_for_paths_that_lie_too_low(demonstrations):
+    rng, low = np.random.default_rng(0), []
+    for one in demonstrations:
+        depth = one.observation.depth.copy()
+        for row, col in rng.integers(1, np.array(depth.shape) - 2, (depth.size // 450, 2)):  # 2% of the pixels
+            depth[row - 1 : row + 2, col - 1 : col + 2] += 0.08
+        actions = one.trajectory.actions.copy()
+        actions[:, [2, 5, 8]] -= 0.06
+        path = Trajectory(actions, one.trajectory.times)
+        low.append(replace(one, observation=replace(one.observation, depth=depth), trajectory=path))
+    with pytest.raises(GeometryError, match="below the table"):
+        check_demonstrations(low).raise_if_wrong()
+
+
 def test_trajectories_shuffled_against_their_images_are_refused(demonstrations):
     found = check_demonstrations(FAULTS["shuffled:demos"].demonstrations(demonstrations)).findings
     assert "other images" in told(found)

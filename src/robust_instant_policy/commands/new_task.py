@@ -8,7 +8,7 @@ from pathlib import Path
 
 from robust_instant_policy.commands.options import positive
 from robust_instant_policy.errors import UsageError
-from robust_instant_policy.files import write_whole
+from robust_instant_policy.files import file_stem, write_whole
 from robust_instant_policy.sanity import errors
 from robust_instant_policy.tasks import check_task, make_task
 from robust_instant_policy.tasks.task import OPTIONAL_METHODS, offers
@@ -41,7 +41,7 @@ def _write(path: Path) -> int:
     where = "" if path.resolve().parent == Path.cwd() else f"cd {path.resolve().parent} && "
     print(f"{path}: a task that runs; change it, then:")
     print(f"    {where}rip new-task --check {task}")
-    print(f"    {where}rip record --task {task} --out data/{path.stem}")
+    print(f"    {where}rip record --task {task} --out data/{file_stem(task)}")
     print(f"    {where}rip eval --tasks {task} --methods neighbours gp --out runs/{path.stem}")
     return 0
 

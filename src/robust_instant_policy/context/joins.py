@@ -7,8 +7,8 @@ corrections d_t of the steps, points and turns alike, minimise
     Σ_t |d_t|² / e_t² + Σ_t |d_{t+1} - d_t + j_t|² / `STEP_M`²
 
 with e_t the error with which demonstrations predict step t from each other (a part of it at key steps, which must be
-met), and j_t the jump at a change of frame: by how much the step between the two frames differs from its neighbours,
-less what demonstrations show there; 0 elsewhere.
+met), and j_t the jump at a change of frame: by how much the motion between the two frames differs from that at the
+nearest steps without a change, less what demonstrations show there; 0 elsewhere.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
@@ -27,23 +28,30 @@ KEY_SHARE = 0.01  # of the error of key steps
 
 
 def joined(
-    hands: FloatArray, errors: FloatArray, key_steps: Collection[int], changes: Collection[int], shown: FloatArray
+    hands: FloatArray,
+    errors: FloatArray,
+    key_steps: Collection[int],
+    changes: Collection[int],
+    demonstrated: FloatArray,
 ) -> FloatArray:
     """``hands (T, 3, 3)``, the gripper's three points at each step, without jumps before the steps ``changes``.
 
-    ``errors (T,)`` of their prediction, metres; ``shown (T - 1, 2)``: demonstrated jumps, see `shown_jumps`.
+    ``errors (T,)`` of their prediction, metres, NaN unknown; ``demonstrated (T - 1, 2)``: jumps, see `shown_jumps`.
     """
-    steps = hand_steps(hands)
-    jumps = np.zeros_like(steps)
-    before = np.array(sorted(changes)) - 1
-    jumps[before] = _unlike_neighbours(steps)[before]
-    for part, most in zip((slice(0, 3), slice(3, 6)), shown.T, strict=True):
+    motions = hand_motions(hands)
+    jumps = np.zeros_like(motions)
+    before = np.array(sorted(changes), dtype=int) - 1
+    usual = np.setdiff1d(np.arange(len(motions)), before)
+    if len(usual):
+        jumps[before] = motions[before] - _interpolated(motions, usual, before)
+    for part, allowed in zip((slice(0, 3), slice(3, 6)), demonstrated.T, strict=True):
         size = np.linalg.norm(jumps[:, part], axis=1)
-        jumps[:, part] *= np.maximum(1 - most / np.maximum(size, 1e-9), 0.0)[:, None]
+        jumps[:, part] *= np.maximum(1 - allowed / np.maximum(size, 1e-9), 0.0)[:, None]
     share = np.ones(len(hands))
     share[list(key_steps)] = KEY_SHARE
     stiff = (NOISE_M / STEP_M) ** 2
-    diagonal = (NOISE_M / (share * np.fmax(errors, NOISE_M))) ** 2 + 2 * stiff
+    errors = np.where(np.isnan(errors), STEP_M, np.fmax(errors, NOISE_M))
+    diagonal = (NOISE_M / (share * errors)) ** 2 + 2 * stiff
     diagonal[[0, -1]] -= stiff
     right = np.zeros((len(hands), 6))
     right[:-1] += stiff * jumps
@@ -57,11 +65,11 @@ def joined(
 def shown_jumps(hands: FloatArray) -> FloatArray:
     """``(T - 1, 2)``: by how much steps of demonstrated ``hands (I, T, 3, 3)`` differ from their neighbours at most, in
     metres and in rad."""
-    unlike = np.stack([_unlike_neighbours(hand_steps(own)) for own in hands]).reshape(len(hands), -1, 2, 3)
+    unlike = np.stack([_unlike_neighbours(hand_motions(own)) for own in hands]).reshape(len(hands), -1, 2, 3)
     return np.linalg.norm(unlike, axis=-1).max(axis=0)
 
 
-def hand_steps(hands: FloatArray) -> FloatArray:
+def hand_motions(hands: FloatArray) -> FloatArray:
     """From each of the ``hands (T, 3, 3)`` to the next: motion of the centre, metres, and rotation vector ``(T - 1,
     6)``, in the world."""
     centre = hands.mean(axis=1)
@@ -70,9 +78,14 @@ def hand_steps(hands: FloatArray) -> FloatArray:
     return np.concatenate([np.diff(centre, axis=0), turns], axis=1)
 
 
-def _unlike_neighbours(steps: FloatArray) -> FloatArray:
-    """``steps (T, D)`` less the mean of those before and after, at the ends less the only one."""
-    if len(steps) < 2:
-        return np.zeros_like(steps)
-    padded = np.concatenate([steps[1:2], steps, steps[-2:-1]])
-    return steps - (padded[:-2] + padded[2:]) / 2
+def _interpolated(motions: FloatArray, usual: NDArray[np.intp], at: NDArray[np.intp]) -> FloatArray:
+    """``(len(at), D)``: the ``motions (T, D)`` of the steps ``usual``, interpolated to the steps ``at``."""
+    return np.stack([np.interp(at, usual, column) for column in motions[usual].T], axis=1)
+
+
+def _unlike_neighbours(motions: FloatArray) -> FloatArray:
+    """``motions (T, D)`` less the mean of those before and after, at the ends less the only one."""
+    if len(motions) < 2:
+        return np.zeros_like(motions)
+    padded = np.concatenate([motions[1:2], motions, motions[-2:-1]])
+    return motions - (padded[:-2] + padded[2:]) / 2

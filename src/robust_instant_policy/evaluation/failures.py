@@ -24,11 +24,12 @@ import numpy as np
 from robust_instant_policy.datasets.video import FILM_OPTIONS, VideoEncoder
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.evaluation.episodes import Episode, EpisodeKey
-from robust_instant_policy.evaluation.rollout import UNPLANNABLE, ScenePolicy, execute
+from robust_instant_policy.evaluation.rollout import ScenePolicy, execute
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.perception import KeypointExtractor, Located
 from robust_instant_policy.perception.accuracy import KnownScene, measure
 from robust_instant_policy.policies import ClosedLoopPolicy, Context, LocatedScene, Stage
+from robust_instant_policy.policies.policy import UNPLANNABLE
 from robust_instant_policy.tasks.task import FrameSink, Task, offers
 from robust_instant_policy.trajectory import Trajectory, downsample
 

@@ -71,12 +71,12 @@ def _begin() -> None:
 def _make(recording: Recording) -> tuple[WorkError | None, tuple[str, int, int, int]]:
     last = (recording.scene.task, recording.count, recording.count, 0)
 
-    def keep(*told: int) -> None:
+    def keep(task: str, there: int, count: int, discarded: int) -> None:
         nonlocal last
-        last = told  # type: ignore[assignment]
+        last = task, there, count, discarded
 
     try:
-        recording.make(keep)  # type: ignore[arg-type]
+        recording.make(keep)
     except Exception as error:  # errors of this package cannot be pickled
         return WorkError.of(error), last
     return None, last

@@ -9,25 +9,14 @@ from typing import Protocol
 
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import KeypointError, PlanningError, RipError, UnreachableError
+from robust_instant_policy.errors import RipError, UnreachableError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import ClosedLoopPolicy, LocatedScene, Plan
-from robust_instant_policy.sanity import DemonstrationError, GeometryError
+from robust_instant_policy.policies.policy import UNPLANNABLE
 from robust_instant_policy.tasks.task import Execution, FrameSink, Task, require
 from robust_instant_policy.trajectory import Trajectory
-
-# What ends a plan and not the run: refusals, and defects in the mathematics, which the row names.
-UNPLANNABLE = (
-    GeometryError,
-    DemonstrationError,
-    KeypointError,
-    PlanningError,
-    ArithmeticError,
-    LookupError,
-    ValueError,
-)
 
 
 def reason(error: Exception) -> str:

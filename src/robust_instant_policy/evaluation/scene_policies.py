@@ -34,9 +34,12 @@ class ReplayedDemonstrator:
     downsampling: str
 
     def plan(self, observation: Observation) -> Plan:
-        return Plan.of(downsample(self.demonstrate(), self.downsampling))
+        return self._plan()
 
     def plan_scene(self, scene: LocatedScene) -> Plan:
+        return self._plan()
+
+    def _plan(self) -> Plan:
         return Plan.of(downsample(self.demonstrate(), self.downsampling))
 
     def executions(self, plan: Plan) -> tuple[Trajectory, ...]:

@@ -16,7 +16,7 @@ from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import ModelError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import FailureAnalysis, Truth, film, true_keypoints
-from robust_instant_policy.evaluation.rollout import UNPLANNABLE, ScenePolicy, roll_out
+from robust_instant_policy.evaluation.rollout import ScenePolicy, roll_out
 from robust_instant_policy.evaluation.scene_policies import RefusingPolicy, ReplayedDemonstrator
 from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.variant import REPLAY, Scene, Variant
@@ -37,6 +37,7 @@ from robust_instant_policy.policies import (
     locate,
     make_policy,
 )
+from robust_instant_policy.policies.policy import UNPLANNABLE
 from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.tasks import make_task

@@ -18,11 +18,23 @@ from numpy.typing import NDArray
 from robust_instant_policy.checks import checked_positive
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.errors import DatasetError, InvalidValueError, KeypointError, PlanningError
 from robust_instant_policy.files import excerpt, read_json, write_whole
 from robust_instant_policy.geometry import FloatArray, as_numbers
 from robust_instant_policy.policies.timed_poses import TimedPoses
+from robust_instant_policy.sanity import DemonstrationError, GeometryError
 from robust_instant_policy.trajectory import Trajectory
+
+# What ends a plan and not the run: refusals, and defects in the mathematics, which the row names.
+UNPLANNABLE = (
+    GeometryError,
+    DemonstrationError,
+    KeypointError,
+    PlanningError,
+    ArithmeticError,
+    LookupError,
+    ValueError,
+)
 
 PLAN_FORMAT = 1  # raised when the layout of plan.json changes
 

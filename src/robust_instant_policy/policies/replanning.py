@@ -10,11 +10,9 @@ import numpy as np
 
 from robust_instant_policy.checks import checked_whole
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import KeypointError, PlanningError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
-from robust_instant_policy.policies.policy import Plan
-from robust_instant_policy.sanity import GeometryError
+from robust_instant_policy.policies.policy import UNPLANNABLE, Plan
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
 ROUNDS = 2  # times that the whole motion is made, at most
@@ -63,7 +61,7 @@ class ReplanningController:
             plan = self._plan(observation)
             if plan is not None:
                 self._actions = plan.trajectory.actions
-                self._next = 0 if ended else self._nearest(action)
+                self._next = 0 if ended else min(self._nearest(action), len(self._actions) - 1)
             elif ended:
                 return None
         waypoints = self._actions[self._next : self._next + self._every]
@@ -76,12 +74,12 @@ class ReplanningController:
     def _plan(self, observation: Observation) -> Plan | None:
         try:
             return self._policy.plan(observation)
-        except (GeometryError, KeypointError, PlanningError):
+        except UNPLANNABLE:
             return None
 
     def _nearest(self, action: FloatArray) -> int:
         """The waypoint after the one nearest to the grippers, among those within ``every`` of the next."""
-        first = max(self._next - self._every, 0)
+        first = min(max(self._next - self._every, 0), len(self._actions) - 1)
         near = self._actions[first : self._next + self._every]
         return first + 1 + int(np.linalg.norm(near - action, axis=1).argmin())
 

@@ -96,14 +96,15 @@ def _unexplained(views: Sequence[View], as_is: Evidence, own: float, other: floa
         advice = "check the camera's pose, the tool's offset and which image belongs to which path"
         return "error", f"{_measured(as_is)}; {advice}", ""
     if not as_is.touches:
-        return "warning", f"{_measured(as_is)}; nothing closes there, so it was not checked further", ""
-    if _fit_others(own, other) and own < SAME_EVERYWHERE:
+        closing = "the gripper closes near no surface" if closes else "nothing closes there"
+        return "warning", f"{_measured(as_is)}; {closing}, so it was not checked further", ""
+    if _fit_others(own, other):
+        if own >= SAME_EVERYWHERE:
+            words = f"what the images show around the gripper is alike in all scenes ({own:.2f} of 1)"
+            return "unchecked", f"{words}: whether each path belongs to its image was not decided", ""
         words = f"the paths fit their own images no better than each other's ({own:.2f} against {other:.2f} of 1)"
         advice = "trajectories are shuffled against images, or the images are mirrored, or of another camera"
         return "error", f"{words}; {advice}", "other images"
-    if own >= SAME_EVERYWHERE:
-        words = f"what the images show around the gripper is alike in all scenes ({own:.2f} of 1)"
-        return "unchecked", f"{words}: whether each path belongs to its image was not decided", ""
     words = f"what the images show around the gripper hardly repeats across the demonstrations ({score:.2f} of 1)"
     return "unchecked", f"{words}: whether the camera is right was not decided", ""
 

@@ -25,6 +25,7 @@ PLANE_SEED = 0
 FAR_AWAY_M = 1e3
 COLUMN_SPACINGS = 1.0  # of the grid's points on the surface, between a point and one measured straight above it
 HOLE_M = 0.015  # from a point to the nearest one of the table, seen from above: beyond it there may be a hole
+HOLE_CELLS = 5  # of the grid: most of a square of so many is deeper where there is a hole
 BESIDE_HOLE_M = 0.06  # from a point to one seen deeper than the table: within it there may be a hole
 COVER_M = 0.005  # of surface above a point that is inside a thing
 
@@ -112,8 +113,9 @@ class View:
 
     @cached_property
     def deeper_points(self) -> FloatArray:
-        """``(N, 3)`` metres, world: below the table, such as in a hole."""
-        return self.points[self.height < -max(RAISED_M, RAISED_DEVIATIONS * self.noise)]
+        """``(N, 3)`` metres, world: below the table, such as in a hole, and not single wrong readings."""
+        low = np.nan_to_num(self.height) < -max(RAISED_M, RAISED_DEVIATIONS * self.noise)
+        return self.points[low & median_filter(low, size=HOLE_CELLS)]
 
     @cached_property
     def tree(self) -> cKDTree:

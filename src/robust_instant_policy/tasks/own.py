@@ -53,7 +53,10 @@ def make_own(name: str, **options: str) -> Task:
     for attribute, default in {**DEFAULTS, "description": description, "close": _nothing}.items():
         if not hasattr(task, attribute):
             setattr(task, attribute, default)
-    task.name = name
+    try:
+        task.name = name
+    except AttributeError:
+        raise UsageError(f"the task {name} must let its attribute name be set; it is the name you gave") from None
     return task
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from inspect import signature
 from typing import Any, Protocol
 
 from robust_instant_policy.demonstration import Demonstration
-from robust_instant_policy.errors import RipError
+from robust_instant_policy.errors import RipError, UsageError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.task import Image, Task, require
 
@@ -57,6 +58,11 @@ def record(
     """
     require(task, "demonstrate")
     asked: dict[str, Any] = {"with_images": with_images, "every": every} if with_images or every > 1 else {}
+    known = signature(task.demonstrate).parameters.values()
+    if not set(asked) <= {one.name for one in known} and not any(one.kind is one.VAR_KEYWORD for one in known):
+        raise UsageError(
+            f"demonstrate() of the task {task.name} takes no with_images and every; what learns from images needs them"
+        )
     if writer.last_seed is not None:
         seed = max(seed, writer.last_seed + 1)
     in_a_row = 0
