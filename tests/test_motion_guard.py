@@ -140,13 +140,13 @@ def test_a_motion_that_ends_outside_the_workspace_is_refused_unless_it_goes_home
 def test_an_arm_that_would_hit_the_base_of_another_is_refused(two):
     arms, limits = two
     beside = replace(arms[1], kinematics=copy(arms[1].kinematics))
-    beside.kinematics.base = arms[0].kinematics.base @ make_pose(np.diag([-1.0, -1.0, 1.0]), [0.45, 0.0, 0.0])
+    beside.kinematics.base = arms[0].kinematics.base @ make_pose(np.eye(3), [0.45, 0.0, 0.0])
     wide = replace(limits, workspace=np.array([[-2.0, -2.0, -0.1], [2.0, 2.0, 2.0]]))
     space = Space([arms[0], beside], wide)
-    away = np.array([0.0, -0.43, 0.434, 0.0, 1.567, 0.0])  # turned to the other side
-    space.check(np.stack([[-0.135, -0.135, 0.693, 0.0, 1.027, 0.0], away])[None], HZ)
-    with pytest.raises(UnreachableError, match=r"its distance from right is 0.00556"):
-        space.check(np.stack([[0.0, -0.015, 0.555, 0.0, 1.041, 0.0], away])[None], HZ)
+    away = np.array([0.0, -0.43, 0.434, 0.0, 1.567, 0.0])  # from the first arm, whose hand comes to the base
+    space.check(np.stack([[0.0, -0.6, 0.87, 0.0, 0.51, 0.0], away])[None], HZ)
+    with pytest.raises(UnreachableError, match=r"its distance from right is 0\.00925"):
+        space.check(np.stack([[0.0, -0.28, 0.87, 0.0, 0.51, 0.0], away])[None], HZ)
 
 
 def state(arm, joints=None, clock=0.0, **more):
@@ -291,6 +291,26 @@ def test_a_state_that_is_no_reason_to_go_on_stops_the_arm(gate, measured, words)
         measured = {"joints": arm.home + np.array([0, 0, 0.5, 0, 0, 0])}
     with pytest.raises(StoppedError, match=words):
         gate.judge([state(arm, **measured)])
+
+
+def test_states_may_trail_the_commands_by_their_latency_and_a_blocked_joint_is_told_as_much_later(gate):
+    gate, arm = gate
+    trailing = round(0.2 * HZ)  # 0.5 rad at the speed of the arm, the limit is 0.35 rad
+    ahead = np.array([0.5, 0, 0, 0, 0, 0])
+    sent = [arm.home]
+
+    def go_on(measured):
+        (command,) = gate.limited([Command(sent[-1] + ahead, arm.finger_travel)])
+        sent.append(command.joints)
+        gate.judge([state(arm, measured, clock=float(len(sent)), latency_s=0.2)])
+
+    while len(sent) < 30:
+        go_on(sent[max(len(sent) - trailing, 0)])
+    held = sent[-trailing]
+    for _ in range(1 + int(0.35 / (arm.joint_speed / HZ))):
+        go_on(held)
+    with pytest.raises(StoppedError, match="joint 1 is away from its command"):
+        go_on(held)
 
 
 def test_a_frozen_state_stops_after_a_tenth_of_a_second(gate):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,6 +26,7 @@ SLOW_RAD_S, HELD_SHARE, HELD_S = 0.3, 1 / 3, 0.5  # a joint that is slow must be
 BLOCKED_S = 1.5  # that a gripper may take to open
 BLOCKED_SHARE = 0.3  # of its travel that it may lack then
 SHARES = (1.0, 0.5, 0.25, 0.1)  # of the way from braking to the wanted step, tried where a limit is near
+KEPT = 1000  # last commands, with which a state of some time ago can be compared
 STOPPING_ROWS = 4  # of the way to rest after a step, that are checked
 
 
@@ -44,6 +46,7 @@ class Gate:
         self._tool = np.array([arm.tool_speed for arm in arms]) / rate_hz
         self._fingers = np.array([arm.finger_speed for arm in arms]) / rate_hz
         self._last: list[Command] = []
+        self._sent: deque[FloatArray] = deque(maxlen=KEPT)
 
     def start(self, states: Sequence[ArmState]) -> None:
         """Take the measured joints as the last command; raises `StoppedError` if the arms are not ready.
@@ -60,6 +63,7 @@ class Gate:
         ]
         self._change = np.zeros((len(states), len(states[0].joints)))
         self._held = np.zeros_like(self._change)
+        self._sent = deque([np.stack([state.joints for state in states])], KEPT)
         self.judge(states)
 
     @property
@@ -92,7 +96,7 @@ class Gate:
                 value = float(np.abs(values).max()) * self._rate**order
                 if value > limit * TOLERANCE:
                     raise UnreachableError(exceeded(arm.name, what, value, limit, unit, key))
-        self._last, self._change = list(commands), change
+        self._take(commands, change)
         return commands
 
     def limited(self, wanted: Sequence[Command]) -> list[Command]:
@@ -112,9 +116,14 @@ class Gate:
         travel = np.array([arm.finger_travel for arm in self._arms])
         before = np.array([command.finger_travel for command in self._last])
         fingers = before + np.clip(fingers.clip(0.0, travel) - before, -self._fingers, self._fingers)
-        self._change = change
-        self._last = [Command(row, float(opening)) for row, opening in zip(last + change, fingers, strict=True)]
-        return self._last
+        commands = [Command(row, float(opening)) for row, opening in zip(last + change, fingers, strict=True)]
+        self._take(commands, change)
+        return commands
+
+    def _take(self, commands: Sequence[Command], change: FloatArray) -> None:
+        """``commands`` are the last ones, ``change (A, J)`` of joints after those before."""
+        self._last, self._change = list(commands), change
+        self._sent.append(np.stack([command.joints for command in commands]))
 
     def _moved(self, index: int, last: FloatArray, change: FloatArray) -> float:
         """Metres by which a ``change (A, J)`` of the joints ``last (A, J)`` moves the tool of arm ``index``."""
@@ -161,7 +170,7 @@ class Gate:
                 self._clocks[index], self._fresh[index] = state.clock, now
             if now - self._fresh[index] > self._stale_s:
                 raise StoppedError(f"{arm.name} sends the same state for more than {self._stale_s:g} s: it is frozen")
-            error = np.abs(state.joints - told.joints)
+            error = self._error(index, state)
             if error.max() > self._limits.following_error:
                 joint = int(np.argmax(error))
                 what = f"joint {joint + 1} is away from its command by"
@@ -176,6 +185,13 @@ class Gate:
                     f"{arm.name}: the gripper is blocked: told to open to {1e3 * told.finger_travel:.0f} mm, it stands "
                     f"at {1e3 * state.finger_travel:.0f} mm; free it and check its cable"
                 )
+
+    def _error(self, index: int, state: ArmState) -> FloatArray:
+        """Differences ``(J,)`` of the measured joints from that command of the state's latency which is nearest."""
+        recent = list(self._sent)[-1 - math.ceil(state.latency_s * self._rate) :]
+        errors = np.abs(np.array(recent)[:, index] - state.joints)
+        nearest: FloatArray = errors[errors.max(axis=1).argmin()]
+        return nearest
 
     def _hold(self, index: int, error: FloatArray, name: str) -> None:
         """Raise `StoppedError` for a joint whose ``error (J,)`` lasts although its command hardly moves: it is held."""

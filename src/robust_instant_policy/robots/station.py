@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from robust_instant_policy.robots.follower import Follower
 from robust_instant_policy.robots.followers import make_follower
 from robust_instant_policy.robots.models import arm_of
 from robust_instant_policy.robots.path import MeasuredPath
-from robust_instant_policy.robots.priority import CONTROL, take_real_time
+from robust_instant_policy.robots.priority import CONTROL, real_time
 from robust_instant_policy.robots.signals import StopRequest
 
 BRAKING_S = 0.24  # in which a motion is brought to rest when somebody asks for it
@@ -182,13 +181,12 @@ class Station:
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
     """No garbage collection, which may take longer than a control step, and a real-time priority for this thread."""
-    collecting, policy, usual = gc.isenabled(), os.sched_getscheduler(0), os.sched_getparam(0)
+    collecting = gc.isenabled()
     gc.disable()
     try:
-        take_real_time(CONTROL)
-        yield
+        with real_time(CONTROL):
+            yield
     finally:
-        os.sched_setscheduler(0, policy, usual)
         if collecting:
             gc.enable()
 

@@ -39,11 +39,11 @@ class Device(Protocol):
     def unplug(self) -> None: ...
 
 
-def make_device(kind: str, twin: SharedTwin, index: int, finger_travel: float) -> Device:
+def make_device(kind: str, twin: SharedTwin, index: int, finger_travel: float, pace: float) -> Device:
     if kind == "viperx":
         return ServoBus(twin, index, finger_travel)
     if kind == "ur5e":
-        return Controller(twin, index, finger_travel)
+        return Controller(twin, index, finger_travel, pace)
     raise CellError(f"an arm with the driver {kind!r} cannot be emulated")
 
 
@@ -52,7 +52,9 @@ def serve(config: CellConfig, twin: Twin) -> None:
     take_real_time(DEVICE)
     shared = SharedTwin(twin)
     devices = {
-        one.name: make_device(one.driver.kind, shared, index, arm_of(one, config.path.parent).finger_travel)
+        one.name: make_device(
+            one.driver.kind, shared, index, arm_of(one, config.path.parent).finger_travel, config.pace
+        )
         for index, one in enumerate(config.arms)
     }
     server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(shared, devices))
