@@ -5,6 +5,7 @@ park ─▶ start image ─▶ soft start ─▶ demonstration ─▶ kept or di
 
 from __future__ import annotations
 
+import os
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from robust_instant_policy.robots.journal import Episode, Journal
 from robust_instant_policy.robots.leader import Leader
 from robust_instant_policy.robots.operator import ENTER, Operator
 from robust_instant_policy.robots.recording import DISCARD, QUIT, demonstration_of, guide, teach
-from robust_instant_policy.robots.station import Station
+from robust_instant_policy.robots.station import HOLDING, Station
 from robust_instant_policy.sanity import check_demonstrations
 
 PREVIEW = "p"
@@ -147,7 +148,7 @@ class Session:
         if has_open_grippers(self.station):
             return
         if operator.ask("a gripper is closed: hold what it has; Enter opens it", ENTER) != ENTER:
-            raise StoppedError(f"{operator.stop.reason}; the arms hold their position")
+            raise StoppedError(f"{operator.stop.reason}; {HOLDING}")
         open_grippers(self.station, operator.stop)
 
     def _park(self) -> None:
@@ -163,17 +164,19 @@ class Session:
                     raise StoppedError("the arms are not parked; they hold their position") from None
                 guide(station, self.leaders, operator, "coupled: lead the arm towards its park pose; Enter lets go")
                 continue
-            if played.stopped:
-                raise StoppedError(f"{played.stopped}; the arms hold their position")
+            played.require_end()
 
 
 def keep_calibration(config: CellConfig, folder: Path) -> None:
     """Copy the cell's file and its calibration files into the dataset, one folder a calibration."""
-    kept = folder / "meta" / f"cell-{config.digest}"
-    for arm in tomllib.loads(read_regular(config.path).decode())["arms"]:
-        files = [arm.get("gripper"), arm.get("leader", {}).get("calibration")]
-        for name in filter(None, files):
-            write_whole(kept / Path(name).name, read_regular(config.path.parent / name))
-    for file in (config.path, config.camera_calibration):
-        if file is not None:
-            write_whole(kept / file.name, read_regular(file))
+    kept, home = folder / "meta" / f"cell-{config.digest}", config.path.parent
+    tables = tomllib.loads(read_regular(config.path).decode())
+    names = [tables.get("camera", {}).get("calibration")]
+    for arm in tables["arms"]:
+        names += [arm.get("gripper"), arm.get("leader", {}).get("calibration")]
+    for name in filter(None, names):
+        inside = (home / name).resolve().is_relative_to(home.resolve())  # two arms' files may have one name
+        write_whole(
+            kept / (os.path.relpath(home / name, home) if inside else Path(name).name), read_regular(home / name)
+        )
+    write_whole(kept / config.path.name, read_regular(config.path))

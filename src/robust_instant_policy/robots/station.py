@@ -33,15 +33,26 @@ from robust_instant_policy.robots.signals import StopRequest
 BRAKING_S = 0.24  # in which a motion is brought to rest when somebody asks for it
 BLENDING_S = 0.5  # in which the difference between measured joints and the first command is taken back
 START_RAD = 0.1  # largest such difference
+HOLDING = "the arms hold their position"
 EMULATED_STALE_S = 0.5  # an emulation shares the processor with what uses it
 
 
 @dataclass(frozen=True)
 class Played:
-    """The measured path of a motion, and why it was ``stopped``, empty where it came to its end."""
+    """The measured path of a motion, and why it was ``stopped``, empty where it came to its end.
+
+    Where a device does not answer, ``holds`` is False: only its own watchdog can have stopped the arm.
+    """
 
     path: MeasuredPath
     stopped: str
+    holds: bool = True
+
+    def require_end(self) -> None:
+        """Raises `StoppedError` for a motion that was stopped."""
+        if self.stopped:
+            known = HOLDING if self.holds else "look at the arms: those that answer hold, the others by their watchdogs"
+            raise StoppedError(f"{self.stopped}; {known}")
 
 
 class Ticker:
@@ -129,14 +140,13 @@ class Station:
             fingers = before + np.clip(fingers - before, -most, most)
             return [Command(one, float(travel)) for one, travel in zip(joints, fingers, strict=True)]
 
-        stopped = ""
+        stopped, holds = "", True
         try:
             self._loop(command, self.gate.admit, log)
-            if stop.reason:
-                stopped = f"stopped ({stop.reason})"
+            stopped = stop.reason
         except (RobotError, UnreachableError) as error:
-            stopped = str(error)
-        return Played(log.path(self.rate_hz, self.arms), stopped)
+            stopped, holds = str(error), isinstance(error, StoppedError | UnreachableError)
+        return Played(log.path(self.rate_hz, self.arms), stopped, holds)
 
     def lead(self, command: Callable[[Sequence[ArmState]], Sequence[Command] | None]) -> None:
         """Let the arms follow ``command(states)``, slowed down by `Gate.limited`, until it returns None."""

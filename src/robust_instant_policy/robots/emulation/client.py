@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import select
 import subprocess
 import sys
 import tempfile
@@ -24,6 +25,7 @@ from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cell import CellConfig, DeviceConfig
 
 TIMEOUT_S = 30.0  # of a request; a scene is rendered within seconds
+STARTING_S = 300.0  # of the process; a simulator takes some ten
 
 
 @dataclass(frozen=True)
@@ -86,11 +88,15 @@ def emulated(config: CellConfig) -> Iterator[Emulation]:
     ):
         assert process.stdin is not None
         assert process.stdout is not None
+        if not select.select([process.stdout], [], [], STARTING_S)[0]:
+            process.kill()
+            raise RobotError(f"the emulated cell did not start within {STARTING_S:g} s; is this computer too busy?")
         line = process.stdout.readline()
         if not line:
             errors.seek(0)
             words = errors.read().decode(errors="replace").strip().splitlines()
-            raise RobotError(f"the emulated cell does not start: {words[-1] if words else 'it ended at once'}")
+            reason = words[-1].removeprefix("rip: ") if words else "it ended at once"
+            raise RobotError(f"the emulated cell does not start: {reason}")
         started = json.loads(line)
         arms = tuple(
             replace(arm, driver=replace(arm.driver, options=MappingProxyType(started["devices"][arm.name])))

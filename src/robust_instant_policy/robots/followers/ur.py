@@ -235,7 +235,11 @@ class RobotiqGripper:
 
     def read(self) -> tuple[float, float]:
         """Travel of each finger in metres, and 1 where the fingers stopped at something, else 0."""
-        position, stopped, fault = (int(line.split()[1]) for line in self._ask("GET POS", "GET OBJ", "GET FLT"))
+        answers = self._ask("GET POS", "GET OBJ", "GET FLT")
+        try:
+            position, stopped, fault = (int(line.split()[1]) for line in answers)
+        except (IndexError, ValueError):
+            raise RobotError(f"the gripper at {self._address} answers {answers}, not three numbers") from None
         if fault:
             raise RobotError(f"the gripper reports fault {fault}; see its manual, and activate it again")
         return (1 - position / 255) * self._travel, float(stopped in (1, 2))
