@@ -21,7 +21,7 @@ from robust_instant_policy.motion.limits import Limits, exceeded
 from robust_instant_policy.motion.state import ArmState, Command, is_gripping
 
 TOLERANCE = 1.05  # of speeds and accelerations that were planned at the limit
-STALE_S = 0.1  # without a new reading; the watchdog's time
+STALE_S = 0.06  # without a new reading; arms must stop within 0.1 s, and it is seen up to a control step later
 SLOW_RAD_S, HELD_SHARE, HELD_S = 0.3, 1 / 3, 0.5  # a joint that is slow must be this near, after this time
 BLOCKED_S = 1.5  # that a gripper may take to open
 BLOCKED_SHARE = 0.3  # of its travel that it may lack then

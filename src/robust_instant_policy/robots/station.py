@@ -34,7 +34,7 @@ BRAKING_S = 0.24  # in which a motion is brought to rest when somebody asks for 
 BLENDING_S = 0.5  # in which the difference between measured joints and the first command is taken back
 START_RAD = 0.1  # largest such difference
 HOLDING = "the arms hold their position"
-EMULATED_STALE_S = 0.5  # an emulation shares the processor with what uses it
+EMULATED_STALE_S = 0.5, 0.2  # at most and at least: an emulation shares the processor with what uses it
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,8 @@ class Station:
         if len({len(arm.home) for arm in self.arms}) > 1:
             counts = ", ".join(f"{arm.name} {len(arm.home)}" for arm in self.arms)
             raise CellError(f"{config.path}: the arms of a cell must have as many joints as each other, not {counts}")
-        stale_s = STALE_S if config.emulation is None else max(EMULATED_STALE_S / config.pace, 2 * STALE_S)
+        most, least = EMULATED_STALE_S
+        stale_s = STALE_S if config.emulation is None else max(most / config.pace, least)
         self.sent_at = 0.0  # of the last command, seconds of a clock that does not jump
         self.gate = Gate(self.arms, config.limits, config.rate_hz, stale_s)
 

@@ -46,6 +46,10 @@ class Emulation:
         """Commands ``(N, A, J + 1)`` that the arms executed."""
         return np.load(io.BytesIO(request(f"{self.url}/commands.npy")), allow_pickle=False)
 
+    def times(self) -> FloatArray:
+        """When they executed them, ``(N,)`` seconds of the machine's clock that does not jump."""
+        return np.load(io.BytesIO(request(f"{self.url}/times.npy")), allow_pickle=False)
+
     def failure(self) -> str:
         """Reason why the task is not done, empty if it is."""
         return str(json.loads(request(f"{self.url}/state"))["failure"])
@@ -58,9 +62,9 @@ class Emulation:
         """Build the scene with a ``seed``; the arms are at home, as if parked."""
         request(f"{self.url}/scene/{seed}", b"")
 
-    def fault(self, arm: str, fault: str) -> None:
-        """Give an arm a fault of `faults.FAULTS`, or none with an empty name."""
-        request(f"{self.url}/fault/{arm}/{fault}", b"")
+    def fault(self, arm: str, fault: str) -> float:
+        """Give an arm a fault of `faults.FAULTS`, or none with an empty name; returns when, on the clock of `times`."""
+        return float(request(f"{self.url}/fault/{arm}/{fault}", b""))
 
 
 @contextmanager

@@ -88,9 +88,13 @@ class Controller:
     def unplug(self) -> None:
         """Pull the network cable: all connections end, and none can be made."""
         self.fault.set("unplugged")
+        self._cut()
         for server in self._servers:
             server.shutdown()
             server.server_close()
+        self._cut()  # what was made meanwhile
+
+    def _cut(self) -> None:
         for connection in list(self._connections):
             with contextlib.suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
