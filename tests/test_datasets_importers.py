@@ -1,6 +1,7 @@
 """Recordings of others become demonstrations, and what they lack is said."""
 
 import json
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -448,7 +449,7 @@ def test_quaternions_of_an_order_that_cannot_be_told_are_not_guessed(tmp_path):
     path = lerobot_folder(tmp_path / "theirs", None, layout(wxyz, gripper=False), key="observation.ee_pose")
     message = refusal(import_demonstrations, path, TASK, known_rig())
     assert "both orders" in message  # as x, y, z, w, the gripper points down, too
-    assert "rotation=" in message
+    assert "rotation in the rig" in message
     message = refusal(import_demonstrations, path, TASK, known_rig(rotation="quat_wxyz"))
     assert "gripper" in message  # there is none; the poses are known now
     with pytest.raises(InvalidValueError, match="quat_xyzw"):
@@ -586,6 +587,26 @@ def test_recordings_are_imported_from_the_command_line(tmp_path, capsys):
         np.testing.assert_allclose(demo.trajectory.actions, original.trajectory.actions, atol=1e-5)
 
 
+def test_an_import_without_a_folder_goes_into_one_named_after_the_task(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "here" / "there"
+    folder.mkdir(parents=True)
+    monkeypatch.chdir(folder)
+    path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector)
+    rig = {"triangle": {"length": 0.1, "opening": 0.08}, "gripper": {"open": 100, "closed": 0}}
+    seen = observation(0)
+    rig |= {"intrinsics": seen.intrinsics.tolist(), "camera_pose": seen.camera_pose.tolist(), "tool": TOOL.tolist()}
+    rig |= {"depth_key": "observation.depth", "depth_unit_m": 0.001}
+    Path("rig.json").write_text(json.dumps(rig))
+    for task, name in (("metaworld/reach", "metaworld-reach"), ("../../push", "..-..-push")):
+        assert main(["import", str(path), "--rig", "rig.json", "--task", task]) == 0
+        assert len(load_demonstrations(Path("data") / name, task)) == 2
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["here", "theirs"]
+    for task in ("", "..", "."):
+        with pytest.raises(SystemExit):
+            main(["import", str(path), "--rig", "rig.json", "--task", task])
+        assert "must be a name" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -595,6 +616,16 @@ def test_recordings_are_imported_from_the_command_line(tmp_path, capsys):
         ({"intrinsic": 1}, "'intrinsic'"),
         ({"intrinsics": [[1, 2]]}, "(3, 3)"),
         ({"depth_unit_m": "mm"}, "number"),
+        ({"depth_unit_m": -0.001}, "depth_unit_m must be a positive"),
+        ({"rate_hz": 0}, "rate_hz must be a positive"),
+        ({"position_unit_m": float("nan")}, "position_unit_m must be a positive"),
+        ({"gripper": {"open": 1, "closed": "x"}}, "closed must be a number"),
+        ({"gripper": {"open": True, "closed": 0}}, "open must be a number"),
+        ({"triangle": {"length": "0.1", "opening": 0.08}}, "length must be a number"),
+        ({"tool": np.diag([1, 1, 1000, 1]).tolist()}, "tool (4, 4) must hold a proper rotation"),
+        ({"tool": np.full((4, 4), np.nan).tolist()}, "tool of shape (4, 4) holds values that are not finite"),
+        ({"joints": {"urdf": "arm.urdf", "link": 3}}, "link must be text"),
+        ({"joints": {"urdf": "arm.urdf", "link": "hand", "names": "a"}}, "names must be a list of text"),
         ({"camera": 3}, "text"),
         ({"rotation": "quat"}, "quat_xyzw"),
         ({"joints": {"urdf": "arm.urdf"}}, "link"),

@@ -8,6 +8,7 @@ from lerobot.robots import Robot
 from lerobot_policy_rip.embodiment import POSE_AXES, Embodiment
 from scipy.spatial.transform import Rotation
 
+from robust_instant_policy.datasets.images import millimetres
 from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Motion
@@ -116,10 +117,10 @@ class RipTwin(Robot):
         numbers = [*self.embodiment.to_robot(cell.measured()), *np.concatenate([poses[:, :3, 3], turns], 1).ravel()]
         seen = self.task.look()
         observation = dict(zip([*self.embodiment.axes, *self._pose_axes], map(float, numbers), strict=True))
-        millimetres = np.rint(np.nan_to_num(seen.depth) * 1000).astype(np.uint16)
+        steps = millimetres(seen.depth)
         depth = {
-            "native": millimetres[..., None],
-            "packed": np.stack([millimetres >> 8, millimetres & 255, 0 * millimetres], -1).astype(np.uint8),
+            "native": steps[..., None],
+            "packed": np.stack([steps >> 8, steps & 255, 0 * steps], -1).astype(np.uint8),
         }
         return {**observation, CAMERA: seen.rgb.copy()} | (
             {} if self.config.depth == "none" else {f"{CAMERA}_depth": depth[self.config.depth]}

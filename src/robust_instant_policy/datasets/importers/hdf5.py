@@ -109,5 +109,5 @@ def choose_camera(path: Path, cameras: Sequence[str], wanted: str | None) -> str
         return cameras[0] if cameras else None
     if wanted not in cameras:
         problem = "has several cameras" if wanted is None else f"has no camera {wanted!r}"
-        raise DatasetError(f"{path} {problem}; give camera= one of: {excerpt(', '.join(cameras)) or 'none'}")
+        raise DatasetError(f"{path} {problem}; give camera, one of: {excerpt(', '.join(cameras)) or 'none'}")
     return wanted

@@ -68,7 +68,7 @@ class JointModel:
         if not pairs or unknown or (self.names and len(pairs) != len(self.names)):
             raise DatasetError(
                 f"the joints of {self.urdf} ({excerpt(', '.join(joints))}) are not those of the recording "
-                f"({excerpt(', '.join(names))}); give names= and columns= in the same order"
+                f"({excerpt(', '.join(names))}); give names and columns in the same order"
             )
         return pairs
 

@@ -162,7 +162,7 @@ def poses_of(
     farthest = float(np.abs(poses[:, :3, 3]).max())
     if farthest > FARTHEST_M:
         raise DatasetError(
-            f"{name}: positions reach {farthest:.0f} m; are they in millimetres? Give position_unit_m=0.001 in the Rig"
+            f"{name}: positions reach {farthest:.0f} m; in millimetres? Set position_unit_m to 0.001 in the rig"
         )
     turns = numbers[:, list(columns.turns)]
     if columns.rotation:
@@ -175,7 +175,7 @@ def poses_of(
     if len(sensible) != 1:
         ways = "both orders" if sensible else "neither order"
         raise DatasetError(
-            f"{name}: its quaternions have no order, and in {ways} the gripper points down; give rotation= in the Rig, "
+            f"{name}: its quaternions have no order, and in {ways} the gripper points down; give rotation in the rig, "
             "quat_xyzw or quat_wxyz"
         )
     poses[:, :3, :3] = matrices[sensible[0]]

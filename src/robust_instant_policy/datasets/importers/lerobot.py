@@ -38,8 +38,8 @@ from robust_instant_policy.geometry import FloatArray, as_numbers
 UNNAMED_POSES = {"cartesian_position": "rpy", "ee_pose": None, "eef_pose": None, "tcp_pose": None}  # and their rotation
 ADVICE = (
     "A LeRobot dataset names the axes of a pose ee.x, ee.y, ee.z and a rotation (ee.wx …, rx …, roll …, qx … qw), or "
-    "Rig(pose_key=, rotation=) says where it is, or Rig(joints=JointModel(urdf, link)) how to compute it; "
-    "Rig(depth_key=, depth_unit_m=) names the feature with the depth"
+    "the rig says where it is (pose_key, rotation) or how to compute it (joints: urdf, link), and which feature holds "
+    "the depth (depth_key, depth_unit_m)"
 )
 
 
@@ -186,7 +186,9 @@ def _first_depth(folder: Folder, episode: int, key: str, unit_m: float | None) -
         return dequantised(codes, feature, f"{folder.root}: {key}")
     unit = unit_m or unit_of(feature)
     if unit is None:
-        raise DatasetError(f"{folder.root} does not say the unit of {key!r}; give depth_unit_m=, metres a step")
+        raise DatasetError(
+            f"{folder.root} does not say the unit of {key!r}; give depth_unit_m, metres per step, in the rig"
+        )
     depth = _first_image(folder, episode, key).astype(np.float32) * np.float32(unit)
     return depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from robust_instant_policy.checks import checked_array, checked_pose, checked_positive
 from robust_instant_policy.datasets.importers.joints import JointModel
 from robust_instant_policy.datasets.importers.layouts import ROTATIONS
 from robust_instant_policy.demonstration import Demonstration, Observation
@@ -45,7 +46,8 @@ class Rig:
     For LeRobot datasets, ``depth_key`` is the feature with the depth and ``depth_unit_m`` the metres per step, where
     the dataset does not say it; ``pose_key`` the one with the poses, ``rotation`` one of `layouts.ROTATIONS`, where
     names leave it open, and ``position_unit_m`` the metres per step of positions; ``joints`` makes poses of joints.
-    Raises `InvalidValueError` for an unknown ``rotation``.
+    Raises `InvalidValueError` for an unknown ``rotation``, a ``tool`` or ``camera_pose`` that is not rigid, and a rate
+    or unit that is not positive.
     """
 
     triangle: GripperTriangle
@@ -65,6 +67,14 @@ class Rig:
     def __post_init__(self) -> None:
         if self.rotation is not None and self.rotation not in ROTATIONS:
             raise InvalidValueError(f"rotation must be one of {', '.join(ROTATIONS)}, got {self.rotation!r}")
+        if self.intrinsics is not None:
+            checked_array("intrinsics", self.intrinsics, "(3, 3)")
+        for name in ("camera_pose", "tool"):
+            if getattr(self, name) is not None:
+                checked_pose(name, getattr(self, name))
+        for name in ("rate_hz", "depth_unit_m", "position_unit_m"):
+            if getattr(self, name) is not None:
+                checked_positive(name, getattr(self, name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,11 +146,11 @@ class SourceEpisode:
             "gripper_values": "the gripper's commands or positions",
             "rgb": "a colour image of the start",
             "depth": "a depth image of the start",
-            "intrinsics": "the camera's intrinsics (known? Rig(intrinsics=), 3 x 3)",
-            "camera_pose": "the camera's pose in the world (known? Rig(camera_pose=), 4 x 4, OpenCV axes)",
-            "tool": "the tool frame within the end effector's (known? Rig(tool=), 4 x 4: z out of the gripper, "
+            "intrinsics": "the camera's intrinsics (in the rig: intrinsics, 3 x 3)",
+            "camera_pose": "the camera's pose in the world (in the rig: camera_pose, 4 x 4, OpenCV axes)",
+            "tool": "the tool frame within the end effector's (in the rig: tool, 4 x 4: z out of the gripper, "
             "y along the line on which the fingers open, origin between the fingertips)",
-            "gripper": f"the meaning of its gripper values{span} (known? Rig(gripper=GripperCommand(open=, closed=)))",
-            "rate_hz": "the recording rate (known? Rig(rate_hz=))",
+            "gripper": f"the meaning of its gripper values{span} (in the rig: gripper, with open and closed)",
+            "rate_hz": "the recording rate (in the rig: rate_hz)",
         }
         return [description for name, description in needs.items() if getattr(self, name) is None]
