@@ -7,6 +7,7 @@ script when no target arrives for 100 ms; its safety system stays in charge at a
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import socket
 import sys
 import threading
@@ -145,6 +146,8 @@ class UR:
         for interface in (self._control, self._receive):
             if interface is not None:
                 _bounded(interface.disconnect, DISCONNECT_SECONDS)
+                # The library's destructors write to the connection; where it was lost, that ends the whole process.
+                ctypes.pythonapi.Py_IncRef(ctypes.py_object(interface))
         self._control = self._receive = None
         self._gripper.disconnect()
 
