@@ -75,7 +75,7 @@ class ServoBus:
         self.fault.set("unplugged")
         if self._thread.is_alive():
             os.write(self._wake, b"!")
-            self._thread.join()
+            self._thread.join(1.0)
 
     def _serve(self) -> None:
         """Answer until the bus is unplugged. The files are closed here: another one may get their numbers at once."""
