@@ -84,9 +84,9 @@ def _send_to(recording: rr.RecordingStream, where: str) -> Path | None:
         return part
     if where == LIVE:
         viewer = Path(sys.executable).with_name("rerun")  # of this environment, which need not be in PATH
-        executable = str(viewer) if viewer.exists() else None
-        rr.spawn(executable_path=executable, recording=recording, default_blueprint=_blueprint())
-    elif where.startswith(("rerun://", "rerun+http://", "rerun+https://")):
+        rr.spawn(connect=False, executable_path=str(viewer) if viewer.exists() else None, recording=recording)
+        where = f"rerun+http://127.0.0.1:{DEFAULT_PORT}/proxy"
+    if where.startswith(("rerun://", "rerun+http://", "rerun+https://")):
         _require_viewer(where)
         recording.connect_grpc(where, default_blueprint=_blueprint())
     else:

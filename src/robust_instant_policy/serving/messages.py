@@ -125,7 +125,7 @@ def read_image(name: str, text: str) -> NDArray:
 def _metres(depth: NDArray, unit: object) -> NDArray:
     if depth.ndim == 3 and depth.shape[2] == 1:
         depth = depth[..., 0]
-    if depth.dtype.kind == "f":
+    if depth.dtype.kind not in "iu":
         return depth
     if isinstance(unit, bool) or not isinstance(unit, int | float | np.number) or not 0 < unit <= MAX_UNIT_M:
         raise InvalidValueError(

@@ -30,7 +30,9 @@ def read_rig(path: Path) -> Rig:
 
 def _value(key: str, kind: str, value: Any, folder: Path) -> Any:
     """``value`` as the type that the annotation ``kind`` of the field ``key`` names. Raises `InvalidValueError`."""
-    kind = kind.removesuffix(" | None")
+    kind, *others = kind.removesuffix(" | None").split(" | ")
+    if others and isinstance(value, list):  # of objects
+        return tuple(_value(key, kind, inner, folder) for inner in value)
     if kind in OBJECTS:
         return _object(key, OBJECTS[kind], value, folder)
     if kind == "FloatArray":
