@@ -35,7 +35,7 @@ class Choice:
     demos: Path | None
     data: Path
     llm: str = "embedded"
-    observation: Path | None = None
+    observation: Observation | None = None
 
     def folder(self, task: str) -> Path:
         return self.demos if self.demos is not None and task == self.task else self.data / task
@@ -43,8 +43,7 @@ class Choice:
     def cell(self, task: str, demonstrations: Sequence[Demonstration]) -> Cell:
         if (is_own(task) or is_installed(task)) and (self.observation is None or task != self.task):
             return SimulatedCell(task)
-        seen = None if self.observation is None else Observation.load(self.observation)
-        return RecordedCell(task, demonstrations, seen)
+        return RecordedCell(task, demonstrations, self.observation if task == self.task else None)
 
 
 @contextlib.contextmanager
