@@ -90,7 +90,9 @@ class Session:
         self._jobs.put(job)
 
     def stop(self) -> None:
-        self.post(self._stop)
+        """Have `run` return after the jobs that were posted; may be called by a signal handler."""
+        self._stopped = True
+        self.post(lambda: None)
 
     def run(self) -> None:
         """Run the cell, and the jobs, until `stop`."""
@@ -111,6 +113,7 @@ class Session:
             if now - shown > 1 / FRAME_HZ:
                 shown = now
                 self._show()
+        self._work(0.0)
 
     def close(self) -> None:
         if self.cell is not None:
@@ -240,7 +243,7 @@ class Session:
         self._draw(self.seed)
         assert self.cell is not None
         for command in motion.commands:
-            if is_stopped():
+            if is_stopped() or self._stopped:
                 break
             self.cell.advance(command)
         return self.cell.failure()
@@ -258,9 +261,6 @@ class Session:
         self._on_played = None
         self._played()
         return True
-
-    def _stop(self) -> None:
-        self._stopped = True
 
     def _work(self, seconds: float) -> None:
         """Call the jobs that are there, waiting ``seconds`` for the first."""
