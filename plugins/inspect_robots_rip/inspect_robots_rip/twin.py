@@ -116,9 +116,9 @@ class RipTwin(EmbodimentBase):
         """End the episode under way, if there is one; what the simulator says of it."""
         if self._puppet is None or self._episode is None:
             return Execution(False, "no episode", 0.0, 0.0)
-        self._puppet.waypoints.put(None)
-        outcome, self._puppet = self._episode.result(), None
-        return outcome
+        puppet, self._puppet = self._puppet, None  # also where the episode has failed
+        puppet.waypoints.put(None)
+        return self._episode.result()
 
     def _observe(self, seen: Seen | None, instruction: str | None = None) -> Observation:
         image, state = seen if seen is not None else (self._scene.rgb, None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from robust_instant_policy.checks import is_trusted
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import CellError, RobotError, StoppedError
 from robust_instant_policy.motion.guard import park_motion
@@ -48,10 +49,11 @@ def require_trust(config: CellConfig, confidence: float | None, cell: str) -> No
             + ("" if cell else " (it names none)")
             + f"; this one is {config.digest}: plan again here"
         )
-    if confidence is None or confidence < config.min_confidence:
+    if not is_trusted(confidence, config.min_confidence):
         value = "none" if confidence is None else f"{confidence:.2f}"
+        limit = f"{config.min_confidence:.2f}" if config.min_confidence else "above 0"
         raise StoppedError(
-            f"the plan's confidence is {value}, the limit is {config.min_confidence:.2f} (min_confidence in the cell's "
+            f"the plan's confidence is {value}, the limit is {limit} (min_confidence in the cell's "
             "file, docs/trust.md); record more demonstrations, or look at the page for the reason"
         )
 
