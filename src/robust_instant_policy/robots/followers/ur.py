@@ -138,15 +138,14 @@ class UR:
         # and the watchdog stops the script.
         control = self._control
         for call in (control.servoStop, lambda: control.stopJ(STOP_DECELERATION), control.stopScript):
-            if not _bounded(call, STOP_SECONDS):
+            if _bounded(call, STOP_SECONDS) is None:
                 return
 
     def disconnect(self) -> None:
         self.stop()
         for interface in (self._control, self._receive):
-            if interface is not None:
-                _bounded(interface.disconnect, DISCONNECT_SECONDS)
-                # The library's destructors write to the connection; where it was lost, that ends the whole process.
+            if interface is not None and not _bounded(interface.disconnect, DISCONNECT_SECONDS):
+                # The destructor would do the same again, and end the whole process where the connection was lost.
                 ctypes.pythonapi.Py_IncRef(ctypes.py_object(interface))
         self._control = self._receive = None
         self._gripper.disconnect()
@@ -200,17 +199,20 @@ def _faults(bits: int) -> tuple[str, ...]:
     return tuple(words for bit, words in SAFETY_BITS.items() if bits >> bit & 1)
 
 
-def _bounded(call: Callable[[], object], seconds: float) -> bool:
-    """Whether ``call`` came back in time; the library may wait for minutes on a connection that is dead."""
+def _bounded(call: Callable[[], object], seconds: float) -> bool | None:
+    """Whether ``call`` succeeded, None if it did not come back in time: the library may wait for minutes on a
+    connection that is dead."""
+    succeeded = []
 
     def run() -> None:
         with contextlib.suppress(RuntimeError):
             call()
+            succeeded.append(True)
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     thread.join(seconds)
-    return not thread.is_alive()
+    return None if thread.is_alive() else bool(succeeded)
 
 
 class RobotiqGripper:
