@@ -12,7 +12,7 @@ from fastapi import HTTPException
 from starlette.responses import JSONResponse
 from starlette.websockets import WebSocket
 
-from robust_instant_policy.serving.address import is_loopback
+from robust_instant_policy.network import is_loopback
 
 SCHEME = "Api-Key "  # of the header Authorization, as openpi's client sends it
 OPEN_PATHS = ("/healthz", "/docs", "/openapi.json")  # they need no key
