@@ -5,7 +5,8 @@
 ENV comes from `plugins/setup.sh`. The commands run in a terminal in which the key n is pressed when the leader says so,
 and Ctrl-C when the policy says that the motion has ended.
 The recording must hold all episodes, and the policy must do the task. ``--record-only`` is for LeRobot 0.4.4, whose
-robots have no depth streams and which has no `lerobot-rollout`: it records two episodes with packed depth.
+robots have no depth streams and which has no `lerobot-rollout`: it records an episode with coded depth, continues with
+a second one, and imports both.
 """
 
 from __future__ import annotations
@@ -27,12 +28,13 @@ ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "lerobot.md"
 LIMIT_S = 1500.0  # of a command
 PROMPT, ENDED = b"press n", b"the motion has ended"  # answered by the key n, and by Ctrl-C
-PACKED = (
-    "lerobot-record --robot.type=rip_twin --robot.depth=packed --robot.seed={seed} --teleop.type=rip_twin_leader "
-    "--teleop.pause_s=60 --dataset.repo_id=me/banana --dataset.root=data/banana-packed --dataset.num_episodes=1 "
-    "--dataset.fps=5 --dataset.episode_time_s=25 --dataset.single_task='pick up the banana' --dataset.video=false "
+CODED = (
+    "lerobot-record --robot.type=rip_twin --robot.depth=coded --robot.seed={seed} --teleop.type=rip_twin_leader "
+    "--teleop.pause_s=60 --dataset.repo_id=me/banana --dataset.root=data/banana-coded --dataset.num_episodes=1 "
+    "--dataset.fps=5 --dataset.episode_time_s=25 --dataset.single_task='pick up the banana' "
     "--dataset.push_to_hub=false --play_sounds=false --resume={resume}"
 )
+IMPORT = "rip import data/banana-coded --rig rig.json --task banana"
 
 
 def main() -> None:
@@ -45,12 +47,16 @@ def main() -> None:
     work.mkdir(parents=True, exist_ok=True)
     path = f"{(options.lerobot / 'bin').resolve()}:{os.environ['PATH']}"
     env = {**os.environ, "PATH": path, "MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1"}
+    name, content, commands = simulator_section()
     if options.record_only:
+        rig = json.loads(content) | {"depth_key": "observation.images.top_depth"}
+        (work / name).write_text(json.dumps(rig))
         for index in range(2):
-            run(PACKED.format(seed=index, resume="true" if index else "false"), work, env)
-        check_recording(work / "data/banana-packed", 2)
+            run(CODED.format(seed=index, resume="true" if index else "false"), work, env)
+        check_recording(work / "data/banana-coded", 2)
+        if "2 demonstrations" not in (said := run(IMPORT, work, env)):
+            sys.exit(f"not both episodes were imported:\n{said[-2000:]}")
     else:
-        name, content, commands = simulator_section()
         (work / name).write_text(content)
         output = [run(command, work, env) for command in commands]
         check_recording(work / "data/banana-lerobot", 5)

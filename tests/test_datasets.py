@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from robust_instant_policy.datasets import DatasetWriter, VideoWriter, load_demonstrations, load_frames
-from robust_instant_policy.datasets.images import encode_depth, read_depth
+from robust_instant_policy.datasets.images import encode_depth, millimetres, read_depth
 from robust_instant_policy.datasets.video import encode_video
 from robust_instant_policy.errors import DatasetError, InvalidValueError, NoDemonstrationsError
 from robust_instant_policy.trajectory import Trajectory
@@ -78,6 +78,11 @@ def test_depth_comes_back_to_the_millimetre_and_no_reading_as_none(tmp_path, dep
     seen = np.isfinite(depth) & (depth > 0)
     np.testing.assert_array_equal(np.isfinite(back), seen)
     assert (np.abs(back - depth)[seen] <= (0.6e-3 if depth[seen].max(initial=0) > 6.5 else 0.06e-3)).all()
+
+
+def test_whole_millimetres_are_none_where_there_is_no_reading_or_none_that_fits():
+    depth = np.array([[0.0004, 0.4996, 65.535], [65.536, -1.0, np.nan], [np.inf, -np.inf, 1e30]], dtype=np.float32)
+    np.testing.assert_array_equal(millimetres(depth), [[0, 500, 65535], [0, 0, 0], [0, 0, 0]])
 
 
 def test_depth_too_far_for_the_millimetre_is_refused_before_anything_is_written(tmp_path):

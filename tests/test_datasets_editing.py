@@ -5,15 +5,16 @@ import json
 import numpy as np
 import pytest
 
+from robust_instant_policy import files
 from robust_instant_policy.cli import main
-from robust_instant_policy.datasets import DatasetWriter, load_demonstrations, load_frames
+from robust_instant_policy.datasets import DatasetWriter, editing, load_demonstrations, load_frames
 from robust_instant_policy.datasets.editing import delete, merge, restore, split
 from robust_instant_policy.errors import DatasetError
 from tests.datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration, images
 
 
-def record(path, seeds, with_images=True):
-    with DatasetWriter(path, TASK, DESCRIPTION, RATE_HZ) as writer:
+def record(path, seeds, with_images=True, description=DESCRIPTION, robot=None):
+    with DatasetWriter(path, TASK, description, RATE_HZ, robot) as writer:
         writer.discard(7)
         for seed in seeds:
             writer.add(demonstration(seed, steps=20), images(seed, 20) if with_images else None)
@@ -46,7 +47,11 @@ def test_deleted_split_and_merged_folders_are_as_if_recorded_so(tmp_path):
     assert merge([tmp_path / "b", tmp_path / "a"], tmp_path / "merged") == 3
     assert_holds(tmp_path / "merged", (1, 2, 0))
     recorded = record(tmp_path / "recorded", (1, 2, 0))
-    for file in ("meta/info.json", "meta/stats.json", "meta/tasks.parquet"):
+    assert not (tmp_path / "merged/meta/calibration.json").exists()  # the camera differs between the episodes
+    alone = record(tmp_path / "alone", (0,))
+    calibrations = [(folder / "meta/calibration.json").read_bytes() for folder in (tmp_path / "a", alone)]
+    assert calibrations[0] == calibrations[1]
+    for file in ("meta/info.json", "meta/stats.json", "meta/tasks.parquet", "README.md"):
         theirs, ours = ((folder / file).read_bytes() for folder in (tmp_path / "merged", recorded))
         if file.endswith("json"):
             flat = (
@@ -97,6 +102,15 @@ def test_what_cannot_be_edited_is_said_and_nothing_is_overwritten(lerobot_files,
         ("nothing", lambda: delete(whole, [0, 1], tmp_path / "out")),
         ("sum", lambda: split(whole, [1, 2], [tmp_path / "out", tmp_path / "out2"])),
         ("exists already", lambda: delete(whole, [0], whole)),
+        ("exists already", lambda: delete(whole, [0], tmp_path / "absent" / ".." / "whole")),
+        ("exists already", lambda: split(whole, [1, 1], [tmp_path / "out", tmp_path / "absent" / ".." / "whole"])),
+        ("different", lambda: split(whole, [1, 1], [tmp_path / "out", tmp_path / "out"])),
+        ("different", lambda: split(whole, [1, 1], [tmp_path / "out", tmp_path / "out" / "inner"])),
+        ("inside", lambda: delete(whole, [0], whole / "inner")),
+        ("cannot write", lambda: delete(whole, [0], "/proc/no/folder")),
+        ("twice", lambda: merge([whole, tmp_path / "absent" / ".." / "whole"], tmp_path / "out")),
+        ("description", lambda: merge([whole, record(tmp_path / "words", [3], False, "push")], tmp_path / "out")),
+        ("robot_type", lambda: merge([whole, record(tmp_path / "ur", [3], False, robot="ur5e")], tmp_path / "out")),
         ("features", lambda: merge([whole, lerobot_files / "ours"], tmp_path / "out")),
         ("restore it first", lambda: merge([lerobot_files / "deleted"], tmp_path / "out")),
         ("in none of", lambda: restore(lerobot_files / "merged", [record(tmp_path / "other", [9])], tmp_path / "out")),
@@ -104,6 +118,36 @@ def test_what_cannot_be_edited_is_said_and_nothing_is_overwritten(lerobot_files,
         with pytest.raises(DatasetError, match=match):
             action()
     assert_holds(whole, (0, 1), with_images=False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_interrupted_edit_leaves_nothing_behind_and_can_be_repeated(tmp_path, monkeypatch):
+    whole = record(tmp_path / "whole", (0, 1, 2), with_images=False)
+    (whole / "start" / ".DS_Store").touch()  # as file browsers leave it
+    outs, pressed = [tmp_path / "a", tmp_path / "b"], []
+
+    def press(path, content, write=files.write_whole):
+        write(path, content)
+        if not pressed and path.name == "info.json":  # the first part is complete
+            pressed.append(path)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(editing, "write_whole", press)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(KeyboardInterrupt):
+        split(whole, [1, 2], outs)
+    assert sorted(tmp_path.iterdir()) == before
+    split(whole, [1, 2], outs)
+    assert_holds(outs[0], (0,), with_images=False)
+    assert_holds(outs[1], (1, 2), with_images=False)
+
+
+def test_a_missing_start_image_is_named(tmp_path):
+    whole = record(tmp_path / "whole", (0, 1), with_images=False)
+    (whole / "start/depth/chunk-000/file-001.png").unlink()
+    with pytest.raises(DatasetError, match=r"depth/chunk-000/file-001\.png is missing"):
+        delete(whole, [0], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_edits_folders(lerobot_files, tmp_path, capsys):

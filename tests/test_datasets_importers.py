@@ -1,6 +1,7 @@
 """Recordings of others become demonstrations, and what they lack is said."""
 
 import json
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.cli import main
-from robust_instant_policy.datasets import DatasetWriter, load_demonstrations, load_frames
+from robust_instant_policy.datasets import DatasetWriter, coded_depth, load_demonstrations, load_frames
 from robust_instant_policy.datasets.importers import (
     GripperCommand,
     JointModel,
@@ -187,6 +188,36 @@ def test_robomimic_files_become_demonstrations(tmp_path):
         assert demo.rate_hz == 20.0
 
 
+def test_robomimic_files_of_two_arms_have_the_gripper_of_each(tmp_path):
+    path = robomimic_file(tmp_path / "lift.hdf5")
+    with h5py.File(path, "r+") as file:
+        for group in file["data"].values():
+            actions = group["actions"][()]
+            del group["actions"]
+            group["actions"] = np.hstack([actions, -actions])
+            group["obs/robot1_eef_pos"] = group["obs/robot0_eef_pos"][()] + [0, 0.3, 0]
+            group["obs/robot1_eef_quat"] = group["obs/robot0_eef_quat"][()]
+    for seed, demo in zip((0, 1, 2, 10), import_demonstrations(path, TASK, Rig(TRIANGLE)), strict=True):
+        original = demonstration(seed, steps=20).trajectory
+        first, second = (TRIANGLE.poses(demo.trajectory.triplets[:, arm]) for arm in (0, 1))
+        np.testing.assert_allclose(first, TRIANGLE.poses(original.triplets[:, 0]), atol=1e-9)
+        np.testing.assert_allclose(second[:, :3, 3] - first[:, :3, 3], np.tile([0, 0.3, 0], (20, 1)), atol=1e-9)
+        np.testing.assert_array_equal(demo.trajectory.gripper_state[:, :1], original.gripper_state)
+        np.testing.assert_array_equal(demo.trajectory.gripper_state[:, 1:], 1 - original.gripper_state)
+
+
+@pytest.mark.parametrize("shape", [(20, 48, 64), (20, 48 * 64)], ids=["without a channel", "flat"])
+def test_robomimic_depth_may_have_other_dimensions(tmp_path, shape):
+    path = robomimic_file(tmp_path / "lift.hdf5")
+    with h5py.File(path, "r+") as file:
+        for group in file["data"].values():
+            depth = group["obs/agentview_depth"][()]
+            del group["obs/agentview_depth"]
+            group["obs/agentview_depth"] = depth.reshape(shape)
+    (first, *_) = import_demonstrations(path, TASK, Rig(TRIANGLE))
+    np.testing.assert_array_equal(first.observation.depth, observation(0).depth)
+
+
 def test_two_robomimic_files_make_one_folder_and_none_of_their_episodes_is_lost_or_doubled(tmp_path):
     first, second = (robomimic_file(tmp_path / name) for name in ("lift.hdf5", "more.hdf5"))
     out = tmp_path / "lift"
@@ -353,10 +384,38 @@ def test_depth_streams_of_lerobot_0_6_are_depth_and_no_camera(lerobot_files, nam
     assert [int(demo.observation.rgb.mean()) for demo in demos] == pytest.approx([40, 60], abs=2)
 
 
+def test_depth_coded_in_a_colour_video_comes_back(tmp_path):
+    path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector, depth=False)
+    key = "observation.images.front_depth"
+    scenes = [np.add.outer(np.linspace(1.0 + start, 0.95 + start, 48), np.linspace(0, 0.05, 64)) for start in (0, 0.2)]
+    for depth in scenes:
+        depth[20:32, 20:40] -= 0.06  # a box
+        depth[8:16, 4:16] = 0  # no reading
+    coded = [np.tile(coded_depth.encode(depth), (n, 1, 1, 1)) for depth, n in zip(scenes, (20, 30), strict=True)]
+    (path / f"videos/{key}/chunk-000").mkdir(parents=True)
+    (path / f"videos/{key}/chunk-000/file-000.mp4").write_bytes(encode_video(np.concatenate(coded), RATE_HZ))
+    file = path / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(file)
+    for name in [name for name in table.column_names if name.startswith("videos/")]:
+        table = table.append_column(name.replace("images.front", "images.front_depth"), table[name])
+    pq.write_table(table, file)
+    info = json.loads((path / "meta/info.json").read_text())
+    info["features"][key] = {"dtype": "video", "shape": [96, 64, 3], "names": ["height", "width", "channels"]}
+    (path / "meta/info.json").write_text(json.dumps(info))
+    demos = import_demonstrations(path, TASK, known_rig(depth_key=key, depth_unit_m=None))
+    for depth, demo in zip(scenes, demos, strict=True):
+        there = depth > 0
+        error = np.abs(demo.observation.depth - depth)[there]
+        assert np.nanmedian(error) < 1e-3
+        assert np.nanquantile(error, 0.9) < 4e-3  # the video blurs edges
+        assert np.isfinite(error).mean() > 0.9
+        assert np.isnan(demo.observation.depth[~there]).mean() > 0.8
+
+
 def test_a_colour_video_is_no_depth(tmp_path):
     path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector, depth=False)
     message = refusal(import_demonstrations, path, TASK, known_rig(depth_key="observation.images.front", camera=None))
-    assert "colour video" in message
+    assert "colour image" in message
 
 
 def test_depth_in_one_row_of_numbers_takes_the_shape_of_the_image(tmp_path):
@@ -407,6 +466,15 @@ def wxyz(rotation):
     return rotation.as_quat(scalar_first=True)
 
 
+def axis_angle(rotation):
+    angles = rotation.magnitude()[:, None]
+    return np.hstack([rotation.as_rotvec() / angles, angles])
+
+
+def degrees(rotation):
+    return rotation.as_euler("xyz", degrees=True)
+
+
 @pytest.mark.parametrize(
     ("names", "rotation", "facts"),
     [
@@ -418,8 +486,17 @@ def wxyz(rotation):
         ({"motors": ["x", "y", "z", "rx", "ry", "rz", "rw", "gripper"]}, xyzw, {}),
         ({"x": 0, "y": 1, "z": 2, "qw": 3, "qx": 4, "qy": 5, "qz": 6, "gripper": 7}, wxyz, {}),
         (["pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z", "gripper"], wxyz, {}),
+        ([*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"), "gripper"], xyzw, {}),
+        (["tcpX", "tcpY", "tcpZ", "tcpQuatX", "tcpQuatY", "tcpQuatZ", "tcpQuatW", "gripperWidth"], xyzw, {}),
+        (["x", "y", "z", *(f"quat_{place}" for place in range(4)), "gripper"], wxyz, {"rotation": "quat_wxyz"}),
+        (["x", "y", "z", "ax", "ay", "az", "angle", "gripper"], axis_angle, {}),
+        (["x", "y", "z", "axis_x", "axis_y", "axis_z", "axis_angle", "gripper_angle"], axis_angle, {}),
+        (["x", "y", "z", "roll", "pitch", "yaw", "gripper"], degrees, {"rotation_unit_rad": np.pi / 180}),
+        ([f"gripper_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz", "opening")], rotvec, {}),
+        ({"motors": {"x": 0, "y": 1, "z": 2, "rx": 3, "ry": 4, "rz": 5, "gripper": 6}}, rotvec, {}),
+        (None, rotvec, {"rotation": "rotvec", "pose_key": "observation.state"}),
+        ([f"motor_{place}" for place in range(8)], wxyz, {"rotation": "quat_wxyz", "pose_key": "observation.state"}),
     ],
-    ids=["rx", "rpy named rx", "ax", "LIBERO", "roll", "rw", "map, qw first", "quat_"],
 )
 def test_names_of_the_axes_say_what_a_pose_is(tmp_path, names, rotation, facts):
     path = lerobot_folder(tmp_path / "theirs", names, layout(rotation))
@@ -433,6 +510,8 @@ def test_names_of_the_axes_say_what_a_pose_is(tmp_path, names, rotation, facts):
     [
         ("observation.state.cartesian_position", rpy),
         ("observation.ee_pose", xyzw),
+        ("observation.left_ee_pose", xyzw),
+        ("observation.ee_pose_right", xyzw),
     ],
 )
 def test_poses_without_names_are_read_as_is_usual_for_their_feature(tmp_path, key, rotation):
@@ -444,15 +523,41 @@ def test_poses_without_names_are_read_as_is_usual_for_their_feature(tmp_path, ke
         np.testing.assert_allclose(demonstration_poses(demo), expected, atol=1e-5)
 
 
+def test_a_pose_without_names_may_end_with_the_gripper(tmp_path):
+    path = lerobot_folder(tmp_path / "theirs", None, layout(xyzw), key="observation.ee_pose")
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
+        original = demonstration(seed, steps=len(demo.trajectory))
+        np.testing.assert_allclose(demonstration_poses(demo), tilted(original), atol=1e-5)
+        np.testing.assert_array_equal(demo.trajectory.gripper_state, original.trajectory.gripper_state)
+
+
 def test_quaternions_of_an_order_that_cannot_be_told_are_not_guessed(tmp_path):
     path = lerobot_folder(tmp_path / "theirs", None, layout(wxyz, gripper=False), key="observation.ee_pose")
     message = refusal(import_demonstrations, path, TASK, known_rig())
     assert "both orders" in message  # as x, y, z, w, the gripper points down, too
-    assert "rotation=" in message
+    assert "rotation in the rig" in message
     message = refusal(import_demonstrations, path, TASK, known_rig(rotation="quat_wxyz"))
     assert "gripper" in message  # there is none; the poses are known now
     with pytest.raises(InvalidValueError, match="quat_xyzw"):
         known_rig(rotation="quaternion")
+
+
+def test_velocities_forces_and_differences_are_no_pose(tmp_path):
+    def state(demo):
+        return np.column_stack([np.full((len(demo.trajectory), 7), 7.0), layout(rotvec)(demo)])
+
+    others = ["vel_x", "vel_y", "vel_z", "wrench.rx", "delta_x", "gripper_force", "gripper_delta"]
+    names = [*others, "x", "y", "z", "rx", "ry", "rz", "gripper"]
+    path = lerobot_folder(tmp_path / "theirs", names, state)
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
+        original = demonstration(seed, steps=len(demo.trajectory))
+        np.testing.assert_allclose(demonstration_poses(demo), tilted(original), atol=1e-5)
+        np.testing.assert_array_equal(demo.trajectory.gripper_state, original.trajectory.gripper_state)
+
+
+def test_angles_in_degrees_are_noticed(tmp_path):
+    path = lerobot_folder(tmp_path / "theirs", ["x", "y", "z", "roll", "pitch", "yaw", "gripper"], layout(degrees))
+    assert "rotation_unit_rad" in refusal(import_demonstrations, path, TASK, known_rig())
 
 
 def test_two_arms_are_told_apart_by_left_and_right(tmp_path):
@@ -485,9 +590,11 @@ def test_positions_in_millimetres_are_noticed_and_converted(tmp_path):
         np.testing.assert_allclose(demo.trajectory.actions, original.trajectory.actions, atol=1e-6)
 
 
-def test_joint_positions_and_a_urdf_become_poses(tmp_path):
+@pytest.fixture
+def urdf(tmp_path):
+    """Two links of 0.3 and 0.2 m that turn about z, and a lift along it."""
     pytest.importorskip("mink")
-    urdf = tmp_path / "arm.urdf"  # two links of 0.3 and 0.2 m that turn about z, and a lift along it
+    urdf = tmp_path / "arm.urdf"
     links = "".join(f'<link name="{name}"/>' for name in ("base", "upper", "lower", "slide", "hand"))
     joints = "".join(
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><axis xyz="0 0 1"/>'
@@ -500,6 +607,30 @@ def test_joint_positions_and_a_urdf_become_poses(tmp_path):
         )
     )
     urdf.write_text(f'<robot name="arm">{links}{joints}</robot>')
+    return urdf
+
+
+def test_joint_positions_of_two_arms_become_poses_in_one_world(tmp_path, urdf):
+    def recorded(demo):
+        steps = len(demo.trajectory)
+        left, right = np.full((steps, 3), 0.1), np.full((steps, 3), -0.1)
+        return np.hstack([right, demo.trajectory.gripper_state, left, 1 - demo.trajectory.gripper_state])
+
+    names = [f"{arm}_{joint}.pos" for arm in ("right", "left") for joint in ("shoulder", "elbow", "lift", "gripper")]
+    path = lerobot_folder(tmp_path / "theirs", names, recorded)
+    models = tuple(JointModel(urdf, "hand", base=make_pose(np.eye(3), [0, y, 0])) for y in (0.4, -0.4))
+    rig = known_rig(joints=models, gripper=GripperCommand(open=1, closed=0))
+    for demo in import_demonstrations(path, TASK, rig):
+        for arm, sign in ((0, 1), (1, -1)):
+            poses = TRIANGLE.poses(demo.trajectory.triplets[:, arm])
+            x, y = (0.3 * f(0.1) + 0.2 * f(0.2) for f in (np.cos, np.sin))
+            np.testing.assert_allclose(poses[:, :3, 3], [[x, sign * (y + 0.4), sign * 0.1]] * len(poses), atol=1e-6)
+        np.testing.assert_array_equal(demo.trajectory.gripper_state.sum(axis=1), 1)
+    with pytest.raises(InvalidValueError, match="two"):
+        known_rig(joints=(*models, models[0]))
+
+
+def test_joint_positions_and_a_urdf_become_poses(tmp_path, urdf):
     turns = np.linspace(0, 1, 30)
 
     def recorded(demo):
@@ -514,10 +645,18 @@ def test_joint_positions_and_a_urdf_become_poses(tmp_path):
         np.testing.assert_allclose(poses[:, :3, 3], np.column_stack([x, y, -t / 10]), atol=1e-6)
         turned = Rotation.from_rotvec(np.outer(3 * t, [0, 0, 1])).as_matrix()
         np.testing.assert_allclose(poses[:, :3, :3], turned, atol=1e-6)
-    named = JointModel(urdf, "hand", ("shoulder", "elbow"), ("shoulder.pos", "elbow.pos"), np.pi / 180)
+    pairs = ("shoulder", "elbow", "lift"), ("shoulder.pos", "elbow.pos", "lift.pos")
+    named = JointModel(urdf, "hand", *pairs, np.pi / 180)
     (demo, _) = import_demonstrations(path, TASK, known_rig(joints=named))
-    assert np.abs(demonstration_poses(demo)[:, 1, 3]).max() < 0.03  # the same numbers, in degrees
+    poses = demonstration_poses(demo)
+    assert np.abs(poses[:, 1, 3]).max() < 0.03  # the same numbers, in degrees; a lift is in metres
+    np.testing.assert_allclose(poses[:, 2, 3], -turns[: len(poses)] / 10, atol=1e-6)
+    assert "unit_rad" in refusal(
+        import_demonstrations, path, TASK, known_rig(joints=JointModel(urdf, "hand", unit_rad=57))
+    )
     assert "hand" in refusal(import_demonstrations, path, TASK, known_rig(joints=JointModel(urdf, "tip")))
+    few = JointModel(urdf, "hand", ("shoulder", "lift"), ("shoulder.pos", "lift.pos"))
+    assert "no column for elbow" in refusal(import_demonstrations, path, TASK, known_rig(joints=few))
     wrong = JointModel(urdf, "hand", ("shoulder",), ("pan",))
     assert "shoulder" in refusal(import_demonstrations, path, TASK, known_rig(joints=wrong))
     urdf.write_text("<robot>")
@@ -554,6 +693,12 @@ def test_frames_at_uneven_times_of_day_are_resampled(tmp_path, unit_s):
     assert [len(demo.trajectory) for demo in known] == [20, 30]
 
 
+def test_times_of_day_that_are_too_coarse_for_frames_are_ignored(tmp_path):
+    path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector)
+    add_features(path, {"timestamp": lambda demo: 1.76e9 + 5 * np.arange(len(demo.trajectory))})  # in float32: 128 s
+    assert [len(demo.trajectory) for demo in import_demonstrations(path, TASK, known_rig())] == [20, 30]
+
+
 def test_times_that_go_back_are_refused(tmp_path):
     path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector)
     add_features(path, {"timestamp": lambda demo: -np.arange(len(demo.trajectory))}, dtype="float64")
@@ -586,6 +731,26 @@ def test_recordings_are_imported_from_the_command_line(tmp_path, capsys):
         np.testing.assert_allclose(demo.trajectory.actions, original.trajectory.actions, atol=1e-5)
 
 
+def test_an_import_without_a_folder_goes_into_one_named_after_the_task(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "here" / "there"
+    folder.mkdir(parents=True)
+    monkeypatch.chdir(folder)
+    path = lerobot_folder(tmp_path / "theirs", NAMES, end_effector)
+    rig = {"triangle": {"length": 0.1, "opening": 0.08}, "gripper": {"open": 100, "closed": 0}}
+    seen = observation(0)
+    rig |= {"intrinsics": seen.intrinsics.tolist(), "camera_pose": seen.camera_pose.tolist(), "tool": TOOL.tolist()}
+    rig |= {"depth_key": "observation.depth", "depth_unit_m": 0.001}
+    Path("rig.json").write_text(json.dumps(rig))
+    for task, name in (("metaworld/reach", "metaworld-reach"), ("../../push", "..-..-push")):
+        assert main(["import", str(path), "--rig", "rig.json", "--task", task]) == 0
+        assert len(load_demonstrations(Path("data") / name, task)) == 2
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["here", "theirs"]
+    for task in ("", "..", "."):
+        with pytest.raises(SystemExit):
+            main(["import", str(path), "--rig", "rig.json", "--task", task])
+        assert "must be a name" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -595,9 +760,21 @@ def test_recordings_are_imported_from_the_command_line(tmp_path, capsys):
         ({"intrinsic": 1}, "'intrinsic'"),
         ({"intrinsics": [[1, 2]]}, "(3, 3)"),
         ({"depth_unit_m": "mm"}, "number"),
+        ({"depth_unit_m": -0.001}, "depth_unit_m must be a positive"),
+        ({"rate_hz": 0}, "rate_hz must be a positive"),
+        ({"position_unit_m": float("nan")}, "position_unit_m must be a positive"),
+        ({"gripper": {"open": 1, "closed": "x"}}, "closed must be a number"),
+        ({"gripper": {"open": True, "closed": 0}}, "open must be a number"),
+        ({"triangle": {"length": "0.1", "opening": 0.08}}, "length must be a number"),
+        ({"tool": np.diag([1, 1, 1000, 1]).tolist()}, "tool (4, 4) must hold a proper rotation"),
+        ({"tool": np.full((4, 4), np.nan).tolist()}, "tool of shape (4, 4) holds values that are not finite"),
+        ({"joints": {"urdf": "arm.urdf", "link": 3}}, "link must be text"),
+        ({"joints": {"urdf": "arm.urdf", "link": "hand", "names": "a"}}, "names must be a list of text"),
         ({"camera": 3}, "text"),
         ({"rotation": "quat"}, "quat_xyzw"),
         ({"joints": {"urdf": "arm.urdf"}}, "link"),
+        ({"joints": [{"urdf": "arm.urdf", "link": "hand"}]}, "two for two arms"),
+        ({"gripper": [{"open": 0, "closed": 1}]}, "gripper must be an object"),
     ],
 )
 def test_a_wrong_description_of_a_rig_is_said_in_one_line(tmp_path, content, said):

@@ -1,5 +1,7 @@
 """What `--rerun` writes is read back by Rerun itself."""
 
+import sys
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -7,11 +9,14 @@ import pytest
 from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.errors import RipError
 from robust_instant_policy.policies import Neighbours
+from robust_instant_policy.reporting.rerun_log import open_recording
 from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_FILE, RunRecord, save_context
 from robust_instant_policy.robots.path import MeasuredPath
 
 pytest.importorskip("rerun")
+import rerun as rr
 from rerun.chunk import RrdReader
 
 LIFTED = np.array([0, 0, 0.005])
@@ -92,6 +97,7 @@ def test_demonstrations_are_on_a_timeline(workbench, tmp_path, capsys):
     file = tmp_path / "demos.rrd"
     assert main(["view", "--demos", str(workbench / "data" / "push-cube"), "--rerun", str(file)]) == 0
     assert "demos.rrd" in capsys.readouterr().out
+    assert (workbench / "data" / "push-cube.html").exists()  # the page, too
     read = Read(file)
     assert {"demonstration", "step"} <= read.timelines["/world/plan/gripper"]
     assert len(read.rows("/world/plan", "strips")) == len(demos)
@@ -99,8 +105,29 @@ def test_demonstrations_are_on_a_timeline(workbench, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("where", "status", "said"), [("demos.html", 2, ".rrd"), ("rerun+http://127.0.0.1:1/proxy", 1, "no viewer answers")]
+    ("where", "status", "said"),
+    [
+        ("demos.html", 2, ".rrd"),
+        ("rerun+http://127.0.0.1:1/proxy", 1, "no viewer answers"),
+        ("/proc/demos.rrd", 1, "cannot log to /proc/demos.rrd"),
+    ],
 )
 def test_a_file_of_another_kind_and_a_viewer_that_is_not_there_are_said(workbench, capsys, where, status, said):
     assert main(["view", "--demos", str(workbench / "data" / "push-cube"), "--rerun", where]) == status
     assert said in capsys.readouterr().err
+
+
+def test_a_recording_that_fails_leaves_the_earlier_file(tmp_path):
+    file = tmp_path / "demos.rrd"
+    file.write_bytes(b"earlier")
+    with pytest.raises(ZeroDivisionError), open_recording(str(file), "demos") as recording:
+        recording.log("world/one", rr.Scalars(1 / 0))
+    assert [(path, path.read_bytes()) for path in tmp_path.iterdir()] == [(file, b"earlier")]
+
+
+def test_a_viewer_that_does_not_start_is_said_in_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))  # without a viewer beside it
+    with pytest.raises(RipError, match=r"cannot log to live: .*Rerun Viewer") as told, open_recording("live", "demos"):
+        pass
+    assert "\n" not in str(told.value)

@@ -14,13 +14,15 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from robust_instant_policy.checks import is_trusted
 from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.datasets.images import encode_depth, encode_png
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import UsageError
+from robust_instant_policy.network import listen
 from robust_instant_policy.policies import Neighbours
-from robust_instant_policy.serving.address import checked_key, listen
+from robust_instant_policy.serving.address import checked_key
 from robust_instant_policy.serving.messages import pack, unpack
 from robust_instant_policy.serving.planner import Planner
 from robust_instant_policy.serving.server import serve
@@ -167,9 +169,10 @@ def test_depth_in_whole_numbers_needs_its_unit(running, scene):
             msgpack.packb({"rgb": {b"__ndarray__": True, b"data": b"x", b"dtype": "<f8", b"shape": [1 << 40]}}),
             "do not fill",
         ),
+        (msgpack.packb({"depth": {b"__npgeneric__": True, b"data": 300, b"dtype": "|i1"}}), "not msgpack"),
         ("text", "binary"),
     ],
-    ids=["noise", "nothing", "nesting", "list", "no image", "objects", "too short", "text"],
+    ids=["noise", "nothing", "nesting", "list", "no image", "objects", "too short", "too large a number", "text"],
 )
 def test_garbage_gets_one_line_and_the_next_client_its_plan(running, scene, message, said):
     with running.connect() as client:
@@ -300,7 +303,43 @@ def test_http_bodies_and_unknown_plans_have_limits(running):
 
     assert running.http("POST", "/plans", content=chunks()).status_code == 413
     assert running.http("POST", "/plans", content=b"{").status_code == 422
-    assert running.http("GET", "/plans/none").status_code == 404
+    damaged = running.http("POST", "/plans", content=b"{", headers={"Content-Type": "application/json"})
+    assert "the body is not JSON" in damaged.json()["error"]
+    for method, path, status in (("GET", "/plans/none", 404), ("GET", "/nowhere", 404), ("PUT", "/plans", 405)):
+        answer = running.http(method, path)
+        assert answer.status_code == status
+        assert set(answer.json()) == {"error"}
+
+
+def test_an_unexpected_error_is_logged_once_with_its_traceback_and_told_in_one_line(
+    running, scene, monkeypatch, caplog
+):
+    monkeypatch.setattr(running.policy, "plan", lambda observation: 1 / 0)
+    with running.connect() as client:
+        client.recv(timeout=30)
+        client.send(pack(as_map(scene)))
+        assert refusal(client) == "unexpected ZeroDivisionError in the server"
+    assert caplog.text.count("Traceback") == caplog.text.count("ZeroDivisionError: ") == 1
+    caplog.clear()
+    answer = running.http("POST", "/plans?wait=30", json=as_json(scene)).json()
+    assert (answer["state"], answer["error"]) == ("failed", "unexpected ZeroDivisionError in the server")
+    assert caplog.text.count("Traceback") == 1
+
+
+def test_a_queued_plan_of_a_websocket_that_is_cancelled_over_http_is_told(running, scene):
+    running.policy.may_go.clear()
+    try:
+        first = running.http("POST", "/plans", json=as_json(scene)).json()
+        with running.connect() as client:
+            client.recv(timeout=30)
+            client.send(pack(as_map(scene)))
+            until(lambda: len(running.planner.queue) == 2)
+            running.http("DELETE", f"/plans/{running.planner.queue[1].id}")
+            assert refusal(client) == "the plan was cancelled"
+        running.http("DELETE", f"/plans/{first['id']}")
+        until(lambda: not running.planner.queue)
+    finally:
+        running.policy.may_go.set()
 
 
 # ---- who may ask
@@ -331,11 +370,31 @@ def test_a_server_that_others_reach_needs_a_key_which_is_never_shown(context, sc
     assert KEY not in "".join(capfd.readouterr())
 
 
+def test_a_key_may_hold_any_letters_and_spaces_around_it_do_not_count(context):
+    server = Running(context, key=" ключ ")
+    try:
+        assert server.http("GET", "/plans", headers={"Authorization": "Api-Key ключ".encode()}).status_code == 200
+        assert server.http("GET", "/plans", headers={"Authorization": "Api-Key ключи".encode()}).status_code == 401
+    finally:
+        server.close()
+
+
 def test_pages_of_other_sites_may_not_use_a_server_on_this_machine(running):
     with pytest.raises(InvalidStatus) as refused:
         running.connect(origin="http://example.org")
     assert refused.value.response.status_code == 403
     assert running.http("GET", "/plans", headers={"Host": "example.org"}).status_code == 403
+    for header in ({"Host": "["}, {"Origin": "http://["}):
+        answer = running.http("GET", "/healthz", headers=header)
+        assert answer.status_code == 400
+        assert "no address" in answer.json()["error"]
+
+
+def test_a_plan_with_confidence_0_is_refused_by_every_limit():
+    for confidence in (None, 0.0, float("nan")):
+        assert not is_trusted(confidence, 0.0)
+    assert is_trusted(0.5, 0.5)
+    assert not is_trusted(0.5, 0.51)
 
 
 def test_a_port_in_use_is_said(capsys):

@@ -17,6 +17,8 @@ from PIL import Image
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.errors import UsageError
+from robust_instant_policy.evaluation.scenes import SPLITS
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import Proposal, Settings, build_context, locate
 from robust_instant_policy.sanity import check_demonstrations, errors
@@ -94,6 +96,14 @@ class Studio:
             "(({width, height}) => [width, height])(document.querySelector('canvas').getBoundingClientRect())"
         )
         return np.array(size) / 2 + height * size[1] / 2
+
+
+def refusal(action: Callable, session) -> str:
+    try:
+        action(session)
+    except UsageError as error:
+        return str(error)
+    return ""
 
 
 def wait_until(true: Callable[[], bool], what: str) -> None:
@@ -193,18 +203,21 @@ def test_a_demonstration_by_keys_is_kept_like_any_other(studio):
     go(cube + np.array([-0.085, 0, -0.005]), "z")
     go(goal * [1, 1, 0] + np.array([-0.02, 0, 0.015]), "x")
     studio.banner("Press Enter")
-    long = studio.seconds()
-    studio.press("z")  # a second back, and to the end again
-    wait_until(lambda: studio.seconds() < long - 0.5, "time goes back")
+    long, _, short = studio.ask(lambda one: (one.status.seconds, one.undo(1.0), one.status.seconds))
+    assert short == pytest.approx(long - 1.0)
     go(goal * [1, 1, 0] + np.array([-0.02, 0, 0.015]), "zx")
     studio.banner("Press Enter")
+    studio.view.get_by_text("Another scene").click()  # would lose the recording
+    studio.view.get_by_text("keep it (Enter) or discard it (X) first").wait_for(timeout=1000 * PATIENCE_S)
+    for action in (lambda one: one.open(None), lambda one: one.play(None, None), lambda one: one.rehearse(None, None)):
+        assert "being recorded" in studio.ask(lambda one, action=action: refusal(action, one))
     studio.press("Enter")
     studio.banner("Your turn")
     *earlier, kept = load_demonstrations(studio.folder, task="push-cube")
     assert len(earlier) == NUM_DEMONSTRATIONS
     assert not errors(check_demonstrations([*earlier, kept]).findings)
     assert kept.rate_hz == 55
-    assert kept.seed == studio.session.seed - 1
+    assert kept.seed == studio.session.seed - 1 == max(one.seed for one in earlier) + 1
     np.testing.assert_array_equal(kept.observation.rgb, start.rgb)
     assert kept.trajectory.gripper_state[0, 0] == 0
     assert kept.trajectory.gripper_state[-1, 0] == 1
@@ -213,7 +226,17 @@ def test_a_demonstration_by_keys_is_kept_like_any_other(studio):
 
 
 @needs_browser
-def test_a_second_browser_looks_on_until_it_takes_the_controls(studio):
+def test_a_recording_ends_after_its_longest_time_and_can_be_taken_back(studio, monkeypatch):
+    monkeypatch.setattr("robust_instant_policy.studio.session.LONGEST_TAKE_S", 1.0)
+    studio.press("u")
+    studio.banner("longest recording is reached")
+    assert studio.seconds() == pytest.approx(1.0, abs=0.01)
+    studio.press("z")
+    studio.banner("Your turn")
+
+
+@needs_browser
+def test_a_second_browser_watches_until_it_takes_the_controls(studio):
     other = studio.another_view()
     studio.banner("Your turn", other)
     other.get_by_text("Another scene").click()
@@ -238,7 +261,21 @@ def test_a_plan_is_made_shown_and_executed(studio):
     view.get_by_text("5 of 5 candidates").wait_for(timeout=3000 * PATIENCE_S)
     assert view.locator("g.keypoint").count() == 10
     assert (np.abs(studio.picture() - bare).max(axis=2) > 40).sum() > 300
+    assert studio.session.seed < min(SPLITS.values()), "the scenes of evaluations stay unseen"
     view.get_by_role("tab", name="Act").click()
+    view.get_by_role("button", name="Execute").click()
+    home = studio.tool()
+    wait_until(lambda: np.linalg.norm(studio.tool() - home) > 0.05, "the arm moves")
+    resumed = threading.Event()
+    studio.session.post(resumed.wait)  # the cell waits for the browser, however slow it is
+    view.get_by_role("button", name="Stop").click()
+    wait_until(lambda: not studio.session._jobs.empty(), "Stop arrives")
+    resumed.set()
+    view.get_by_text("Stopped").wait_for(timeout=1000 * PATIENCE_S)
+    end = studio.page.plans.trajectory.triplets[-1, 0, 1:].mean(axis=0)
+    assert np.linalg.norm(studio.target() - end) > 0.05, "the arm is not sent to the end of the plan"
+    wait_until(lambda: np.linalg.norm(studio.tool() - studio.target()) < 0.01, "the arm holds")
+    view.get_by_role("button", name="Same scene again").click()
     view.get_by_role("button", name="Execute").click()
     view.get_by_text("Success: the cube is in the goal disc").wait_for(timeout=1000 * PATIENCE_S)
 

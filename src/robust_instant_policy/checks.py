@@ -29,19 +29,33 @@ def checked_whole(name: str, value: object, least: int = 0) -> int:
 
 
 def checked_array(name: str, values: ArrayLike, shape: str) -> NDArray[np.float64]:
-    """``values`` as finite float64 with as many dimensions as ``shape`` names, such as "(T, D)".
+    """``values`` as finite float64 of a ``shape`` such as "(T, D)", or "(T, 3)" where the last must be 3.
 
     Text, booleans, complex numbers, NaN and infinity raise `InvalidValueError`.
     """
     array = as_numbers(f"{name} {shape}", values)
     if np.asarray(values).dtype == bool:
         raise InvalidValueError(f"{name} {shape} must be an array of numbers, got elements of type bool")
-    if array.ndim != len(shape.strip("()").removesuffix(",").split(",")):
+    sizes = [size.strip() for size in shape.strip("()").removesuffix(",").split(",")]
+    if array.ndim != len(sizes) or any(a.isdigit() and int(a) != b for a, b in zip(sizes, array.shape, strict=True)):
         raise InvalidValueError(f"{name} must be {shape}, got shape {array.shape}")
     if not np.isfinite(array).all():
         first = tuple(int(index) for index in np.argwhere(~np.isfinite(array))[0])
         raise InvalidValueError(f"{name} of shape {array.shape} holds values that are not finite (first at {first})")
     return array
+
+
+def checked_pose(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """``values`` as a rigid pose ``(4, 4)`` float64; anything else raises `InvalidValueError`."""
+    pose = checked_array(name, values, "(4, 4)")
+    rotation = pose[:3, :3]
+    if np.abs(rotation).max() > 1.1 or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+        raise InvalidValueError(f"{name} (4, 4) must hold a proper rotation")
+    if np.linalg.det(rotation) < 0:
+        raise InvalidValueError(f"{name} (4, 4) must hold a proper rotation, not a reflection")
+    if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
+        raise InvalidValueError(f"the last row of {name} (4, 4) must be 0 0 0 1; is it transposed?")
+    return pose
 
 
 def _is_number(value: object, kind: type) -> bool:
@@ -50,3 +64,8 @@ def _is_number(value: object, kind: type) -> bool:
 
 def _got(value: object) -> str:
     return f"got {value!r} ({type(value).__name__})"
+
+
+def is_trusted(confidence: float | None, least: float) -> bool:
+    """Whether a plan may be executed: it has a ``confidence`` above 0 of at least ``least``."""
+    return confidence is not None and confidence > 0 and confidence >= least

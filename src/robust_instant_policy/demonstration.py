@@ -16,6 +16,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from robust_instant_policy.checks import checked_array, checked_pose
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.files import open_regular, write_whole
 from robust_instant_policy.geometry import FloatArray, as_numbers
@@ -52,10 +53,11 @@ class Observation:
         if depth.shape != rgb.shape[:2]:
             raise InvalidValueError(f"depth must be {rgb.shape[:2]} like the image, got {depth.shape}")
         depth[np.isinf(depth) | (depth < 0)] = np.nan
-        intrinsics = as_numbers("intrinsics", self.intrinsics)
+        intrinsics = checked_array("intrinsics", self.intrinsics, "(3, 3)")
         _check_intrinsics(intrinsics, *rgb.shape[:2])
-        camera_pose = as_numbers("camera_pose", self.camera_pose)
-        _check_camera_pose(camera_pose)
+        camera_pose = checked_pose("camera_pose", self.camera_pose)
+        if np.abs(camera_pose[:3, 3]).max() > FARTHEST_CAMERA_M:
+            raise InvalidValueError(f"camera_pose puts the camera at {camera_pose[:3, 3]}; is that in metres?")
         for name, value in (
             ("rgb", rgb),
             ("depth", depth),
@@ -97,8 +99,6 @@ class Observation:
 
 def _check_intrinsics(intrinsics: FloatArray, height: int, width: int) -> None:
     """Raises `InvalidValueError` unless they are those of a pinhole camera with an image of this size in pixels."""
-    if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all():
-        raise InvalidValueError(f"intrinsics must be (3, 3) and finite, got {intrinsics.shape}")
     (fx, skew, cx), (other_skew, fy, cy), last = intrinsics
     if not np.allclose(last, [0, 0, 1], atol=1e-6):
         raise InvalidValueError("the last row of intrinsics (3, 3) must be 0 0 1; is it transposed?")
@@ -117,21 +117,6 @@ def _check_intrinsics(intrinsics: FloatArray, height: int, width: int) -> None:
             f"intrinsics (3, 3) put the principal point at ({cx:g}, {cy:g}) of an image of {width} x {height} pixels; "
             "are they another camera's, or of another resolution?"
         )
-
-
-def _check_camera_pose(camera_pose: FloatArray) -> None:
-    """Raises `InvalidValueError` unless it is a rigid pose ``(4, 4)`` near the origin of the world."""
-    if camera_pose.shape != (4, 4) or not np.isfinite(camera_pose).all():
-        raise InvalidValueError(f"camera_pose must be (4, 4) and finite, got {camera_pose.shape}")
-    rotation = camera_pose[:3, :3]
-    if np.abs(rotation).max() > 1.1 or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
-        raise InvalidValueError("camera_pose (4, 4) must hold a proper rotation")
-    if np.linalg.det(rotation) < 0:
-        raise InvalidValueError("camera_pose (4, 4) must hold a proper rotation, not a reflection")
-    if not np.allclose(camera_pose[3], [0, 0, 0, 1], atol=1e-6):
-        raise InvalidValueError("the last row of camera_pose (4, 4) must be 0 0 0 1; is it transposed?")
-    if np.abs(camera_pose[:3, 3]).max() > FARTHEST_CAMERA_M:
-        raise InvalidValueError(f"camera_pose puts the camera at {camera_pose[:3, 3]}; is that in metres?")
 
 
 # What zipfile, zlib and NumPy's header reader raise for content that is not theirs.

@@ -7,6 +7,8 @@ import errno
 import fcntl
 import json
 import os
+import secrets
+import shutil
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -123,12 +125,41 @@ def require_replaceable(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Create ``path`` and its parents, durably."""
+    """Create ``path`` and its parents, durably. Raises `DatasetError`."""
     if path.is_dir():
         return
     make_folder(path.parent)
-    path.mkdir(exist_ok=True)
-    _sync_folder(path.parent)
+    try:
+        path.mkdir(exist_ok=True)
+        _sync_folder(path.parent)
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """A hidden folder beside ``path`` to write into; it takes that name when the block ends, and is removed when it
+    raises.
+
+    Raises `DatasetError` where ``path`` is there and not an empty folder, or cannot be written.
+    """
+    try:
+        is_free = not path.exists() or (path.is_dir() and next(path.iterdir(), None) is None)
+    except OSError as error:
+        raise write_error(path, error) from error
+    if not is_free:
+        raise DatasetError(f"{path} exists already; choose a new folder")
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART_SUFFIX}")
+    try:
+        make_folder(part)
+        yield part
+        try:
+            part.replace(path)
+            _sync_folder(path.parent)
+        except OSError as error:
+            raise write_error(path, error) from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def finished_files(path: Path) -> Iterator[Path]:

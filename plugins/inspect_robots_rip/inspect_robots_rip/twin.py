@@ -38,8 +38,8 @@ class Puppet:
         self.waypoints: SimpleQueue[FloatArray | None] = SimpleQueue()
         self.seen: SimpleQueue[Seen | None] = SimpleQueue()
 
-    def act(self, image: np.ndarray, action: FloatArray) -> FloatArray | None:
-        self.seen.put((image, action))
+    def act(self, observation: rip.Observation, action: FloatArray) -> FloatArray | None:
+        self.seen.put((observation.rgb, action))
         return self.waypoints.get()
 
 
@@ -83,9 +83,10 @@ class RipTwin(EmbodimentBase):
         self._end()
         chosen = scene.init_seed if scene.init_seed is not None else seed or 0
         self._scene = self._thread.submit(self._task.reset, chosen).result()
-        self._puppet, self._steps = Puppet(self._task.execute_hz), 0
-        self._episode = self._thread.submit(self._task.follow, self._puppet, MAX_SECONDS)
-        self._episode.add_done_callback(lambda _, ended=self._puppet.seen: ended.put(None))
+        puppet = Puppet(self._task.execute_hz)
+        self._puppet, self._steps = puppet, 0
+        self._episode = self._thread.submit(self._task.follow, puppet, MAX_SECONDS)
+        self._episode.add_done_callback(lambda _: puppet.seen.put(None))
         return self._observe(self._look(), scene.instruction)
 
     def step(self, action: Action) -> StepResult:
@@ -116,9 +117,9 @@ class RipTwin(EmbodimentBase):
         """End the episode under way, if there is one; what the simulator says of it."""
         if self._puppet is None or self._episode is None:
             return Execution(False, "no episode", 0.0, 0.0)
-        self._puppet.waypoints.put(None)
-        outcome, self._puppet = self._episode.result(), None
-        return outcome
+        puppet, self._puppet = self._puppet, None  # also where the episode has failed
+        puppet.waypoints.put(None)
+        return self._episode.result()
 
     def _observe(self, seen: Seen | None, instruction: str | None = None) -> Observation:
         image, state = seen if seen is not None else (self._scene.rgb, None)

@@ -8,7 +8,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
-from robust_instant_policy.errors import UnknownNameError
+from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.tasks import TASK_NAMES
 
 from .env import RipEnv
@@ -23,12 +23,12 @@ class RipEnvConfig(EnvConfig):
     """One of the simulated tasks, by the name that ``rip eval --tasks`` takes.
 
     With ``live_images=false`` observations hold the image of the start of the episode, which is much faster, and all
-    that a policy in open loop looks at. ``max_seconds`` bounds an episode; it ends earlier when the commands stay the
-    same for `env.HOLD_SECONDS`.
+    that a policy in open loop looks at. ``fps`` is the rate of the cell's control; 0 takes it. ``max_seconds`` bounds
+    an episode; it ends earlier when the commands stay the same for `env.HOLD_SECONDS`.
     """
 
     task: str | None = "push-cube"
-    fps: int = 55
+    fps: int = 0
     live_images: bool = True
     max_seconds: float = 120.0
     features: dict[str, PolicyFeature] = field(default_factory=dict)
@@ -38,7 +38,10 @@ class RipEnvConfig(EnvConfig):
         if self.task not in TASK_NAMES:
             raise UnknownNameError("task", str(self.task), TASK_NAMES)
         aloha = self.task.startswith("aloha")
-        self.fps = 50 if aloha else 55
+        rate = 50 if aloha else 55
+        if self.fps not in (0, rate):
+            raise UsageError(f"{self.task} is controlled at {rate} Hz: leave out env.fps, or give {rate}")
+        self.fps = rate
         size = IMAGE_SIZES["aloha"] if aloha else IMAGE_SIZE
         dimensions = 14 if self.task == "aloha-sweep" else 7
         self.features = {

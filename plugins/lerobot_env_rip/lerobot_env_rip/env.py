@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from lerobot_policy_rip.embodiment import Embodiment
 
+from robust_instant_policy.datasets.images import millimetres
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.simulated_task import SimulatedTask
 
@@ -75,6 +76,6 @@ class RipEnv(gymnasium.Env):
         self._task.close()
 
     def _observe(self) -> dict[str, Any]:
-        depth = np.rint(np.nan_to_num(self._seen.depth) * 1000).astype(np.uint16)
+        depth = millimetres(self._seen.depth)
         state = self._embodiment.to_robot(self._task.cell.measured())
         return {"agent_pos": state, "pixels": {"top": self._seen.rgb}, "images.top_depth": depth}

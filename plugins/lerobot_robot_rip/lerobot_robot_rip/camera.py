@@ -9,6 +9,7 @@ import numpy as np
 from lerobot.cameras import Camera
 from numpy.typing import NDArray
 
+from robust_instant_policy.datasets.images import millimetres
 from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.robots.camera import Frame
@@ -84,7 +85,7 @@ class RipRealSense(Camera):
     def read_latest_depth(self, max_age_ms: int = 1000) -> NDArray[np.uint16]:
         """The depth ``(H, W, 1)`` of the image that was read last."""
         shown = self._shown or self._frame(max_age_ms / 1e3)
-        return np.rint(np.nan_to_num(shown.depth) * 1000).astype(np.uint16)[..., None]
+        return millimetres(shown.depth)[..., None]
 
     read_depth = async_read_depth = read_latest_depth
 

@@ -13,8 +13,7 @@ class RipTwinConfig(RobotConfig):
     """The cell of ``task``, with the scene of ``seed``.
 
     Each action takes ``1 / fps`` seconds of simulated time, so ``fps`` must be LeRobot's. ``depth`` is "native" (uint16
-    millimetres ``(H, W, 1)``, LeRobot 0.6), "packed" (high byte, low byte, 0 of the millimetres in an image, for older
-    versions with ``--dataset.video=false``) or "none".
+    millimetres ``(H, W, 1)``, LeRobot 0.6), "coded" (`datasets.coded_depth`, for the video of older ones) or "none".
     """
 
     task: str = "aloha-pick-banana"

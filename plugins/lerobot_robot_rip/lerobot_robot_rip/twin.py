@@ -6,8 +6,11 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from lerobot.robots import Robot
 from lerobot_policy_rip.embodiment import POSE_AXES, Embodiment
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from robust_instant_policy.datasets import coded_depth
+from robust_instant_policy.datasets.images import millimetres
 from robust_instant_policy.errors import UnknownNameError, UsageError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Motion
@@ -17,7 +20,7 @@ from robust_instant_policy.tasks.simulated_task import SimulatedTask
 
 from .config_rip import RipTwinConfig
 
-DEPTH_CHANNELS = {"native": 1, "packed": 3, "none": 0}
+DEPTHS = ("native", "coded", "none")
 CAMERA = "top"
 
 
@@ -33,8 +36,8 @@ class RipTwin(Robot):
 
     def __init__(self, config: RipTwinConfig):
         super().__init__(config)
-        if config.depth not in DEPTH_CHANNELS:
-            raise UnknownNameError("depth", config.depth, DEPTH_CHANNELS)
+        if config.depth not in DEPTHS:
+            raise UnknownNameError("depth", config.depth, DEPTHS)
         self.config = config
         self.cameras = {CAMERA: None}
         self.seed = config.seed
@@ -63,11 +66,9 @@ class RipTwin(Robot):
     @cached_property
     def observation_features(self) -> dict[str, Any]:
         features: dict[str, Any] = dict.fromkeys([*self.embodiment.axes, *self._pose_axes], float)
-        size = self.task.look().rgb.shape[:2]
-        features[CAMERA] = (*size, 3)
-        if channels := DEPTH_CHANNELS[self.config.depth]:
-            features[f"{CAMERA}_depth"] = (*size, channels)
-        return features
+        seen = self.task.look()
+        images = {CAMERA: seen.rgb, **self._depth(seen.depth)}
+        return features | {name: image.shape for name, image in images.items()}
 
     @property
     def is_connected(self) -> bool:
@@ -116,14 +117,14 @@ class RipTwin(Robot):
         numbers = [*self.embodiment.to_robot(cell.measured()), *np.concatenate([poses[:, :3, 3], turns], 1).ravel()]
         seen = self.task.look()
         observation = dict(zip([*self.embodiment.axes, *self._pose_axes], map(float, numbers), strict=True))
-        millimetres = np.rint(np.nan_to_num(seen.depth) * 1000).astype(np.uint16)
-        depth = {
-            "native": millimetres[..., None],
-            "packed": np.stack([millimetres >> 8, millimetres & 255, 0 * millimetres], -1).astype(np.uint8),
-        }
-        return {**observation, CAMERA: seen.rgb.copy()} | (
-            {} if self.config.depth == "none" else {f"{CAMERA}_depth": depth[self.config.depth]}
-        )
+        return {**observation, CAMERA: seen.rgb.copy(), **self._depth(seen.depth)}
+
+    def _depth(self, depth: NDArray) -> dict[str, NDArray]:
+        """``depth (H, W)``, metres, as it is recorded."""
+        if self.config.depth == "none":
+            return {}
+        is_native = self.config.depth == "native"
+        return {f"{CAMERA}_depth": millimetres(depth)[..., None] if is_native else coded_depth.encode(depth)}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         command = self.embodiment.from_robot([action[axis] for axis in self.embodiment.axes])

@@ -10,8 +10,9 @@ from robust_instant_policy.commands.options import add_method, method_settings, 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.errors import MissingExtraError
 from robust_instant_policy.llm import connect
+from robust_instant_policy.network import listen
 from robust_instant_policy.policies import KeypointPolicy, Neighbours, RobustInstantPolicy
-from robust_instant_policy.serving.address import KEY_VARIABLE, checked_key, listen
+from robust_instant_policy.serving.address import KEY_VARIABLE, checked_key
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

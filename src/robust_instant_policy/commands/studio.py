@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 from robust_instant_policy.commands.options import DATA
 from robust_instant_policy.datasets.folder import read_recording
-from robust_instant_policy.errors import MissingExtraError
+from robust_instant_policy.datasets.layout import RIP_PATH
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.errors import MissingExtraError, UsageError
+from robust_instant_policy.llm import model_name
 from robust_instant_policy.tasks import require_task
 
 DEFAULT_PORT, DEFAULT_TASK = 8080, "push-cube"
@@ -31,15 +37,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    try:
-        from robust_instant_policy.studio.server import Choice, serve
-    except ModuleNotFoundError as error:
-        if error.name and error.name.startswith("robust_instant_policy"):
-            raise
-        raise MissingExtraError(error.name or "viser", "studio") from error
-    task = options.task or (read_recording(options.demos)["task"] if options.demos else DEFAULT_TASK)
+    task = options.task or (_recorded_task(options.demos) if options.demos else DEFAULT_TASK)
     if options.demos is None:
         require_task(task)
-    choice = Choice(task, options.demos, DATA / "studio", options.llm, options.observation)
-    serve(choice, options.host, options.port)
+    observation = Observation.load(options.observation) if options.observation else None
+    model_name(options.llm)  # a spec that names no model is refused here, not at the first plan
+    with _undisturbed():
+        try:
+            from robust_instant_policy.studio.server import Choice, serve
+        except ModuleNotFoundError as error:
+            if error.name and error.name.startswith("robust_instant_policy"):
+                raise
+            raise MissingExtraError(error.name or "viser", "studio") from error
+    serve(Choice(task, options.demos, DATA / "studio", options.llm, observation), options.host, options.port)
     return 0
+
+
+def _recorded_task(folder: Path) -> str:
+    """The task of the demonstrations in ``folder``."""
+    if not (folder / RIP_PATH).is_file():
+        raise UsageError(f"{folder} is no folder of demonstrations; add --task NAME to record into it")
+    return read_recording(folder)["task"]
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ctrl-C waits until the end: some libraries catch it while they are imported, and it would be lost."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

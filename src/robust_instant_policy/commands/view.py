@@ -1,4 +1,4 @@
-"""`rip view`: write a page that shows every demonstration of a folder, or log them for Rerun."""
+"""`rip view`: write a page that shows every demonstration of a folder, and log them for Rerun."""
 
 from __future__ import annotations
 
@@ -23,7 +23,5 @@ def run(options: argparse.Namespace) -> int:
         with open_recording(options.rerun, demonstrations[0].task or "demonstrations") as recording:
             log_demonstrations(recording, demonstrations)
         print(options.rerun)
-        if options.out is None:
-            return 0
     print(write_page(options.demos, options.out or beside(options.demos, ".html")))
     return 0

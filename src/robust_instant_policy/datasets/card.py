@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.datasets.tables import json_file
+from robust_instant_policy.files import write_whole
+from robust_instant_policy.geometry import FloatArray
 
 CARD = """\
 ---
@@ -34,16 +37,20 @@ LeRobotDataset {codebase_version}: `LeRobotDataset("NAME", root=FOLDER)` opens i
 
 def dataset_card(info: Mapping[str, Any], task: str, description: str) -> bytes:
     """``README.md`` of a folder with the content ``info`` of ``meta/info.json``."""
-    robot = info["robot_type"] or "not named"
-    return CARD.format(title=" ".join(description.split()), task=task, robot=robot, **info).encode()
+    robot = info.get("robot_type") or "not named"
+    return CARD.format_map({**info, "title": " ".join(description.split()), "task": task, "robot": robot}).encode()
 
 
-def calibration(observation: Observation) -> dict[str, Any]:
-    """``meta/calibration.json`` in the layout of deepen-grade: intrinsics in pixels, camera to world, OpenCV axes."""
-    (fx, _, cx), (_, fy, cy), _ = observation.intrinsics.tolist()
-    return {
-        layout.VIDEO_KEY: {
-            "intrinsics": {"fx": fx, "fy": fy, "cx": cx, "cy": cy},
-            "extrinsics": observation.camera_pose.ravel().tolist(),
-        }
-    }
+def write_calibration(root: Path, episode: int, intrinsics: FloatArray, camera_pose: FloatArray) -> None:
+    """Write the camera ``(3, 3)`` pixels, ``(4, 4)`` camera to world, of the first ``episode``; remove the file with
+    the first one whose camera differs.
+
+    The layout of ``meta/calibration.json`` is that of deepen-grade.
+    """
+    (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
+    camera = {"intrinsics": {"fx": fx, "fy": fy, "cx": cx, "cy": cy}, "extrinsics": camera_pose.ravel().tolist()}
+    path, content = root / layout.CALIBRATION_PATH, json_file({layout.VIDEO_KEY: camera})
+    if episode == 0:
+        write_whole(path, content)
+    elif path.exists() and path.read_bytes() != content:
+        path.unlink()

@@ -6,10 +6,10 @@ takes them from the folder that was edited.
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,9 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
+from robust_instant_policy.datasets.card import dataset_card, write_calibration
 from robust_instant_policy.datasets.folder import (
+    REPAIR,
     STATISTICS_PREFIX,
     Folder,
     inside,
@@ -27,12 +29,11 @@ from robust_instant_policy.datasets.folder import (
     read_recording,
     read_table,
 )
-from robust_instant_policy.datasets.statistics import Statistics, combine, feature_statistics
-from robust_instant_policy.datasets.tables import listed, parquet, read_statistics, task_table
+from robust_instant_policy.datasets.reader import square
+from robust_instant_policy.datasets.statistics import Statistics, extended, feature_statistics
+from robust_instant_policy.datasets.tables import json_file, listed, parquet, read_statistics, task_table
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import excerpt, finished_files, lock_folder, make_folder, read_regular, write_whole
-
-START = Path("start")  # the folder of start-of-episode images
+from robust_instant_policy.files import excerpt, new_folder, read_regular, write_whole
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def delete(path: str | Path, episodes: Collection[int], out: str | Path) -> int:
     kept = [one for one in there if one.episode not in set(episodes)]
     if not kept:
         raise DatasetError(f"nothing of {path} would be left")
-    return _write(kept, Path(out))
+    return _write([(kept, out)])
 
 
 def split(path: str | Path, sizes: Sequence[int], outs: Sequence[str | Path]) -> None:
@@ -65,13 +66,14 @@ def split(path: str | Path, sizes: Sequence[int], outs: Sequence[str | Path]) ->
             f"{path}, got {' '.join(map(str, sizes))}"
         )
     ends = np.cumsum(sizes)
-    for size, end, out in zip(sizes, ends, outs, strict=True):
-        _write(there[end - size : end], Path(out))
+    _write([(there[end - size : end], out) for size, end, out in zip(sizes, ends, outs, strict=True)])
 
 
 def merge(paths: Sequence[str | Path], out: str | Path) -> int:
     """Write the episodes of several folders of one task into ``out``; returns how many. Raises `DatasetError`."""
-    return _write([one for path in paths for one in _episodes(Path(path))], Path(out))
+    if len({Path(path).resolve() for path in paths}) < len(paths):
+        raise DatasetError("a folder is named twice; name each once, else its episodes would be in the new one twice")
+    return _write([([one for path in paths for one in _episodes(Path(path))], out)])
 
 
 def restore(edited: str | Path, originals: Sequence[str | Path], out: str | Path) -> int:
@@ -93,7 +95,7 @@ def restore(edited: str | Path, originals: Sequence[str | Path], out: str | Path
         )
     tasks = {" ".join(map(str, row["tasks"])) for row in folder.episodes if isinstance(row.get("tasks"), list)}
     description = tasks.pop() if len(tasks) == 1 else None
-    return _write([one for one in found if one is not None], Path(out), set(folder.info["features"]), description)
+    return _write([([one for one in found if one is not None], out)], set(folder.info["features"]), description)
 
 
 def _episodes(path: Path) -> list[Recorded]:
@@ -111,48 +113,69 @@ def _actions(folder: Folder, episode: int) -> bytes:
 
 
 def _write(
-    episodes: Sequence[Recorded], out: Path, keep: Collection[str] | None = None, description: str | None = None
+    parts: Sequence[tuple[Sequence[Recorded], str | Path]],
+    keep: Collection[str] | None = None,
+    description: str | None = None,
 ) -> int:
-    """Write ``episodes`` into the new folder ``out``, with the features ``keep`` or all of them."""
+    """Write each part into its new folder, with the features ``keep`` or all of them; returns the number of episodes.
+
+    The folders appear when all of them are complete, or not at all.
+    """
+    outs = [Path(out).resolve() for _, out in parts]  # what is called "absent/../there" now would exist later
+    if any(one == other or one in other.parents for one, other in permutations(outs, 2)):
+        raise DatasetError("the new folders must be different ones, none of them inside another")
+    for root in {one.folder.root for episodes, _ in parts for one in episodes}:
+        if any(root.resolve() in out.parents for out in outs):
+            raise DatasetError(f"a new folder must not lie inside {root}")
+    with ExitStack() as stack:
+        folders = [stack.enter_context(new_folder(out)) for out in outs]
+        return sum(
+            _fill(folder, episodes, keep, description) for folder, (episodes, _) in zip(folders, parts, strict=True)
+        )
+
+
+def _fill(out: Path, episodes: Sequence[Recorded], keep: Collection[str] | None, description: str | None) -> int:
+    """Write ``episodes`` into the empty folder ``out``; returns how many."""
     first = episodes[0]
     features = {key: value for key, value in first.folder.info["features"].items() if keep is None or key in keep}
     for one in episodes:
-        _require_alike(first, one)
-    if out.exists() and (not out.is_dir() or next(finished_files(out), None) is not None):
-        raise DatasetError(f"{out} exists already; choose a new folder")
-    make_folder(out)
-    lock = lock_folder(out)
-    try:
-        text = description or first.recording.get("description") or first.recording["task"]
-        whole: dict[str, Statistics] = {}
-        frames = 0
-        for place, one in enumerate(episodes):
-            statistics = _copy(one, out, place, frames, features, text)
-            whole = {key: combine([whole[key], new]) if whole else new for key, new in statistics.items()}
-            frames += one.folder.episodes[one.episode]["length"]
-        seeds = [seed for recording in _recordings(episodes) for seed in recording.get("discarded_seeds", [])]
-        own = {**first.recording, "description": text, "discarded_seeds": seeds}
-        info = {
-            **first.folder.info,
-            "total_episodes": len(episodes),
-            "total_frames": frames,
-            "splits": {"train": f"0:{len(episodes)}"},
-            "video_path": layout.VIDEO_PATTERN if any(f["dtype"] == "video" for f in features.values()) else None,
-            "features": features,
-        }
-        write_whole(out / layout.RIP_PATH, _json(own))
-        write_whole(out / layout.TASKS_PATH, parquet(task_table(text)))
-        write_whole(out / layout.STATS_PATH, _json({key: listed(value) for key, value in whole.items()}))
-        write_whole(out / layout.INFO_PATH, _json(info))  # last: it finishes the folder
-    finally:
-        os.close(lock)
+        _require_alike(first, one, description)
+    text = description or _description(first)
+    whole: dict[str, Statistics] = {}
+    frames = 0
+    for place, one in enumerate(episodes):
+        statistics = _copy(one, out, place, frames, features, text)
+        whole = extended(whole, statistics)
+        frames += one.folder.episodes[one.episode]["length"]
+    seeds = [seed for recording in _recordings(episodes) for seed in recording.get("discarded_seeds", [])]
+    own = {**first.recording, "description": text, "discarded_seeds": seeds}
+    info = {
+        **first.folder.info,
+        "total_episodes": len(episodes),
+        "total_frames": frames,
+        "splits": {"train": f"0:{len(episodes)}"},
+        "video_path": layout.VIDEO_PATTERN if any(f["dtype"] == "video" for f in features.values()) else None,
+        "features": features,
+    }
+    write_whole(out / layout.RIP_PATH, json_file(own))
+    write_whole(out / layout.TASKS_PATH, parquet(task_table(text)))
+    write_whole(out / layout.CARD_PATH, dataset_card(info, first.recording["task"], text))
+    write_whole(out / layout.STATS_PATH, json_file({key: listed(value) for key, value in whole.items()}))
+    write_whole(out / layout.INFO_PATH, json_file(info))
     return len(episodes)
 
 
-def _require_alike(first: Recorded, other: Recorded) -> None:
+def _description(one: Recorded) -> str:
+    return one.recording.get("description") or one.recording["task"]
+
+
+def _require_alike(first: Recorded, other: Recorded, description: str | None) -> None:
+    """Raises `DatasetError` unless both may be in one folder, with the ``description`` or else with their own."""
     ours, theirs = first.folder, other.folder
     for what, a, b in (
         ("task", first.recording["task"], other.recording["task"]),
+        ("description", description or _description(first), description or _description(other)),
+        ("robot_type", ours.info.get("robot_type"), theirs.info.get("robot_type")),
         ("recording rate", ours.rate_hz, theirs.rate_hz),
         ("features", _shapes(ours), _shapes(theirs)),
     ):
@@ -183,6 +206,7 @@ def _copy(
     statistics = {key: value for key, value in read_statistics(one.folder.root, one.episode).items() if key in features}
     statistics |= {name: feature_statistics(values.reshape(-1, 1)) for name, values in counters.items()}
     _copy_files(one, out, place, features)
+    _copy_calibration(one, out, place)
     frames = _frames(one, counters, features)
     write_whole(out / layout.episode_path(layout.DATA_PATTERN, place), parquet(frames))
     row = _row(one, place, first_frame, features, {name: statistics[name] for name in counters}, description)
@@ -238,19 +262,32 @@ def _copy_files(one: Recorded, out: Path, place: int, features: Mapping[str, Any
         if row.get(f"videos/{key}/from_timestamp") != 0:
             raise DatasetError(f"{root} keeps several episodes in one video, unlike rip; restore it from the original")
         here = {"chunk_index": row[f"videos/{key}/chunk_index"], "file_index": row[f"videos/{key}/file_index"]}
-        content = read_regular(inside(root, layout.VIDEO_PATTERN.format(video_key=key, **here)))
+        content = _read(inside(root, layout.VIDEO_PATTERN.format(video_key=key, **here)))
         write_whole(out / layout.VIDEO_PATTERN.format(video_key=key, chunk_index=chunk, file_index=file), content)
-    for kind in (folder.name for folder in sorted(inside(root, START).iterdir())):
-        pattern = f"{START}/{kind}/{layout.CHUNK_FILE}.png"
-        content = read_regular(inside(root, layout.episode_path(pattern, one.episode)))
+    for pattern in (layout.START_RGB_PATTERN, layout.START_DEPTH_PATTERN):
+        content = _read(inside(root, layout.episode_path(pattern, one.episode)))
         write_whole(out / layout.episode_path(pattern, place), content)
+
+
+def _copy_calibration(one: Recorded, out: Path, place: int) -> None:
+    row = one.folder.episodes[one.episode]
+    try:
+        camera = square(row.get(layout.INTRINSICS_COLUMN), 3), square(row.get(layout.CAMERA_POSE_COLUMN), 4)
+    except ValueError as error:
+        raise DatasetError(
+            f"{one.folder.root} is damaged: the camera of episode {one.episode}: {excerpt(error)}; {REPAIR}"
+        ) from None
+    write_calibration(out, place, *camera)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return read_regular(path)
+    except FileNotFoundError:
+        raise DatasetError(f"{path} is missing; {REPAIR}") from None
 
 
 def _feature_of(column: str) -> str | None:
     """The feature that a column of meta/episodes belongs to: ``stats/KEY/…`` or ``videos/KEY/…``."""
     top, _, rest = column.partition("/")
     return rest.rpartition("/")[0] if top in ("stats", "videos") else None
-
-
-def _json(content: Mapping[str, Any]) -> bytes:
-    return json.dumps(content, indent=2, ensure_ascii=False).encode()

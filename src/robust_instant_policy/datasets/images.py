@@ -52,6 +52,13 @@ def encode_depth(depth: NDArray[np.float32]) -> tuple[bytes, float]:
     return encode_png(steps), unit
 
 
+def millimetres(depth: NDArray) -> NDArray[np.uint16]:
+    """``depth (H, W)`` metres in whole millimetres, as most cameras give it; 0 where there is no reading, and beyond
+    `MAX_STEPS`."""
+    steps = np.rint(np.nan_to_num(np.asarray(depth, dtype=np.float64), posinf=0.0, neginf=0.0) * 1000)
+    return np.where((steps > 0) & (steps <= MAX_STEPS), steps, 0).astype(np.uint16)
+
+
 def read_rgb(path: Path) -> NDArray[np.uint8]:
     """RGB image ``(H, W, 3)`` uint8."""
     return np.asarray(_open(path).convert("RGB"))

@@ -78,8 +78,8 @@ def _read_demonstration(folder: Folder, episode: int, task: str) -> Demonstratio
         observation = Observation(
             rgb=read_rgb(rgb_path),
             depth=read_depth(depth_path, _depth_unit(row[layout.DEPTH_UNIT_COLUMN])),
-            intrinsics=_square(row[layout.INTRINSICS_COLUMN], 3),
-            camera_pose=_square(row[layout.CAMERA_POSE_COLUMN], 4),
+            intrinsics=square(row[layout.INTRINSICS_COLUMN], 3),
+            camera_pose=square(row[layout.CAMERA_POSE_COLUMN], 4),
         )
         return Demonstration(
             observation,
@@ -106,7 +106,8 @@ def _depth_unit(value: object) -> float:
     return value
 
 
-def _square(values: object, side: int) -> FloatArray:
+def square(values: object, side: int) -> FloatArray:
+    """A matrix ``(side, side)`` that was stored in a row, row-major. Raises `ValueError`."""
     if not (isinstance(values, list) and len(values) == side * side):
         raise ValueError(f"a matrix of {side} x {side} numbers is not one")
     return as_numbers("a matrix", values).reshape(side, side)

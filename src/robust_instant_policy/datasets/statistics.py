@@ -58,3 +58,10 @@ def combine(parts: Sequence[Statistics]) -> dict[str, FloatArray]:
         "count": count.sum(axis=0),
         **{name: (share * stacked[name]).sum(axis=0) for name in QUANTILES},
     }
+
+
+def extended(earlier: Mapping[str, Statistics], statistics: Mapping[str, Statistics]) -> dict[str, Statistics]:
+    """Statistics of each feature with one more episode; one by one, so that a resumed folder gets equal numbers."""
+    if not earlier:
+        return dict(statistics)
+    return {key: combine([earlier[key], statistics[key]]) for key in statistics}

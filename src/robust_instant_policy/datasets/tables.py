@@ -101,6 +101,11 @@ def task_table(description: str) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
+def json_file(content: Mapping[str, Any]) -> bytes:
+    """The content of a JSON file."""
+    return json.dumps(content, indent=2, ensure_ascii=False).encode()
+
+
 def parquet(table: pa.Table) -> bytes:
     """The content of a Parquet file."""
     sink = pa.BufferOutputStream()

@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.card import calibration, dataset_card
+from robust_instant_policy.datasets.card import dataset_card, write_calibration
 from robust_instant_policy.datasets.folder import Folder, inside, open_folder, read_recording, read_seed
 from robust_instant_policy.datasets.images import encode_depth, encode_png
-from robust_instant_policy.datasets.statistics import Statistics, combine, feature_statistics, image_statistics
+from robust_instant_policy.datasets.statistics import Statistics, extended, feature_statistics, image_statistics
 from robust_instant_policy.datasets.tables import (
     episode_table,
     features_of,
     frame_table,
+    json_file,
     listed,
     parquet,
     read_statistics,
@@ -38,7 +39,6 @@ from robust_instant_policy.files import (
     finished_files,
     lock_folder,
     make_folder,
-    write_error,
     write_whole,
 )
 from robust_instant_policy.geometry import FloatArray
@@ -65,10 +65,7 @@ class DatasetWriter:
         self.task, self.description, self.rate_hz = task, description or task, float(rate_hz)
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise DatasetError(f"the recording rate must be positive, got {rate_hz} Hz")
-        try:
-            make_folder(self.path)
-        except OSError as error:
-            raise write_error(self.path, error) from error
+        make_folder(self.path)
         self.robot_type = robot_type
         self._folder: Folder | None = None
         self._statistics: dict[str, Statistics] = {}
@@ -168,7 +165,7 @@ class DatasetWriter:
             self._folder = open_folder(self.path, self.task)
             for episode in range(self.num_episodes):
                 try:
-                    self._statistics = _combined(self._statistics, read_statistics(self.path, episode))
+                    self._statistics = extended(self._statistics, read_statistics(self.path, episode))
                 except (KeyError, ValueError, TypeError, IndexError) as error:
                     raise DatasetError(
                         f"{self.path} is damaged: the statistics of episode {episode} are not as written "
@@ -201,7 +198,7 @@ class DatasetWriter:
             "rate_hz": self.rate_hz,
             "discarded_seeds": discarded_seeds,
         }
-        write_whole(self.path / layout.RIP_PATH, _json(own))
+        write_whole(self.path / layout.RIP_PATH, json_file(own))
         self._discarded_seeds = discarded_seeds
 
     def _check(
@@ -269,9 +266,10 @@ class DatasetWriter:
         row |= self._write_start(demonstration, episode)
         self._write_file(layout.DATA_PATTERN, episode, parquet(frame_table(columns)))
         self._write_file(layout.EPISODES_PATTERN, episode, parquet(episode_table(row, statistics)))
-        whole = _combined(self._statistics, statistics)
+        whole = extended(self._statistics, statistics)
         features = features_of(demonstration.trajectory.num_arms, images, self.rate_hz)
-        self._write_calibration(demonstration, episode)
+        seen = demonstration.observation
+        write_calibration(self.path, episode, seen.intrinsics, seen.camera_pose)
         info = self._write_dataset(features, whole, episode + 1, first_frame + length)
         earlier = [] if self._folder is None else self._folder.episodes
         return Folder(self.path, info, [*earlier, row]), whole
@@ -308,14 +306,6 @@ class DatasetWriter:
             layout.INFO_COLUMN: json.dumps(dict(demonstration.info), sort_keys=True, default=_number),
         }
 
-    def _write_calibration(self, demonstration: Demonstration, episode: int) -> None:
-        """Write the camera's calibration beside the tables; remove it once the camera has moved."""
-        path, content = self.path / layout.CALIBRATION_PATH, _json(calibration(demonstration.observation))
-        if episode == 0:
-            write_whole(path, content)
-        elif path.exists() and path.read_bytes() != content:
-            path.unlink()
-
     def _write_dataset(
         self, features: dict[str, Any], statistics: Mapping[str, Statistics], num_episodes: int, num_frames: int
     ) -> dict[str, Any]:
@@ -338,23 +328,12 @@ class DatasetWriter:
         if num_episodes == 1:
             write_whole(self.path / layout.TASKS_PATH, parquet(task_table(self.description)))
         write_whole(self.path / layout.CARD_PATH, dataset_card(info, self.task, self.description))
-        write_whole(self.path / layout.STATS_PATH, _json({key: listed(value) for key, value in statistics.items()}))
-        write_whole(self.path / layout.INFO_PATH, _json(info))
+        write_whole(self.path / layout.STATS_PATH, json_file({key: listed(value) for key, value in statistics.items()}))
+        write_whole(self.path / layout.INFO_PATH, json_file(info))
         return info
 
     def _write_file(self, pattern: str, episode: int, content: bytes) -> None:
         write_whole(self.path / layout.episode_path(pattern, episode), content)
-
-
-def _combined(earlier: Mapping[str, Statistics], statistics: Mapping[str, Statistics]) -> dict[str, Statistics]:
-    """Statistics with one more episode; one by one, so that a resumed folder gets equal numbers."""
-    if not earlier:
-        return dict(statistics)
-    return {key: combine([earlier[key], statistics[key]]) for key in statistics}
-
-
-def _json(content: dict[str, Any]) -> bytes:
-    return json.dumps(content, indent=2, ensure_ascii=False).encode()
 
 
 def _number(value: object) -> object:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import email.utils
-import ipaddress
 import math
 import os
 import re
@@ -17,6 +16,7 @@ import httpx2
 
 from robust_instant_policy.errors import ModelError
 from robust_instant_policy.llm.reply import Complaint, UnreadableReplyError, one_line, read_complaint, read_json
+from robust_instant_policy.network import is_loopback
 
 CONNECT_TIMEOUT_S = 5.0
 TLS_PROBE_S = 1.0  # for the handshake that tells whether a port expects TLS
@@ -57,7 +57,7 @@ class Connection:
         try:
             self._client = httpx2.AsyncClient(
                 headers=headers,
-                trust_env=not _is_loopback(urllib.parse.urlsplit(url).hostname or ""),  # the environment's proxies
+                trust_env=not is_loopback(urllib.parse.urlsplit(url).hostname or ""),  # the environment's proxies
                 verify=httpx2.create_ssl_context(),
                 timeout=httpx2.Timeout(None, connect=CONNECT_TIMEOUT_S),
             )
@@ -178,18 +178,11 @@ def _key(url: str) -> tuple[str, str]:
     key = os.environ.get(variable, "").strip()  # files and pipes leave a line break behind it
     if not (key.isascii() and key.isprintable()):
         raise ModelError(f"{variable} holds characters that no key has; set it to the key alone")
-    if key and parts.scheme == "http" and not _is_loopback(host):
+    if key and parts.scheme == "http" and not is_loopback(host):
         raise ModelError(
             f"the key in {variable} would travel unencrypted to {url}; use https or an SSH tunnel, or unset {variable}"
         )
     return variable, key
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _retry_after(headers: httpx2.Headers) -> float:

@@ -7,7 +7,9 @@ Needs the extra `rerun`.
 
 from __future__ import annotations
 
+import os
 import socket
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +20,7 @@ import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import MissingExtraError, RipError, UsageError
-from robust_instant_policy.files import excerpt, make_folder, require_replaceable
+from robust_instant_policy.files import PART_SUFFIX, excerpt, make_folder, require_replaceable
 from robust_instant_policy.geometry import FloatArray, lift
 from robust_instant_policy.policies.policy import Plan
 from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_FILE
@@ -41,35 +43,62 @@ KEPT, HALLUCINATED = (90, 90, 200), (200, 60, 60)  # colours of candidates
 @contextmanager
 def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
     """A recording called ``name``: in the file ``where`` (.rrd), shown by a viewer (`LIVE`), or sent to the address of
-    one (``rerun+http://…``). It is complete when the block ends.
+    one (``rerun+http://…``). It is complete when the block ends; a file takes its name then.
 
-    Raises `UsageError` for anything else, `MissingExtraError` without Rerun, `RipError` where no viewer answers.
+    Raises `UsageError` for anything else, `MissingExtraError` without Rerun, `RipError` where no viewer answers and
+    where the file cannot be written.
     """
     try:
         import rerun as rr
     except ImportError as error:
         raise MissingExtraError("rerun-sdk", "rerun") from error
     recording = rr.RecordingStream("robust-instant-policy")
+    try:
+        part = _send_to(recording, where)
+    except RuntimeError as error:
+        raise RipError(f"cannot log to {where}: {excerpt(str(error).splitlines()[0])}") from None
+    try:
+        recording.send_recording_name(name)
+        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        yield recording
+        _flush(recording, where)
+        recording.disconnect()
+        if part is not None:
+            part.replace(where)
+    finally:
+        recording.disconnect()
+        if part is not None:
+            part.unlink(missing_ok=True)
+
+
+def _send_to(recording: rr.RecordingStream, where: str) -> Path | None:
+    """Open ``where`` for the recording; returns the hidden neighbour of a file, to which it is written first."""
+    import rerun as rr
+
+    if where.endswith(".rrd"):
+        path = Path(where)
+        require_replaceable(path)
+        make_folder(path.absolute().parent)
+        part = path.with_name(f".{path.name}.{os.getpid()}{PART_SUFFIX}")
+        recording.save(part, default_blueprint=_blueprint())
+        return part
     if where == LIVE:
-        recording.spawn(default_blueprint=_blueprint())
-    elif where.startswith(("rerun://", "rerun+http://", "rerun+https://")):
+        viewer = Path(sys.executable).with_name("rerun")  # of this environment, which need not be in PATH
+        rr.spawn(connect=False, executable_path=str(viewer) if viewer.exists() else None, recording=recording)
+        where = f"rerun+http://127.0.0.1:{DEFAULT_PORT}/proxy"
+    if where.startswith(("rerun://", "rerun+http://", "rerun+https://")):
         _require_viewer(where)
         recording.connect_grpc(where, default_blueprint=_blueprint())
-    elif where.endswith(".rrd"):
-        require_replaceable(Path(where))
-        make_folder(Path(where).absolute().parent)
-        recording.save(where, default_blueprint=_blueprint())
     else:
         raise UsageError(f"--rerun takes a file that ends in .rrd, {LIVE!r} or the address of a viewer, not {where!r}")
-    recording.send_recording_name(name)
-    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    yield recording
+    return None
+
+
+def _flush(recording: rr.RecordingStream, where: str) -> None:
     try:
         recording.flush(timeout_sec=FLUSH_S)
     except (RuntimeError, ValueError) as error:
         raise RipError(f"what was logged did not arrive at {where}: {excerpt(error)}; is a viewer there?") from None
-    finally:
-        recording.disconnect()
 
 
 def _require_viewer(address: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 import traceback
 from typing import Annotated, Any
@@ -12,6 +13,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, PlainTextResponse
 from fastapi.security import APIKeyHeader
 from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException as AnyHTTPException  # also of unknown paths and methods
+from starlette.websockets import WebSocketDisconnect
 
 from robust_instant_policy import __version__
 from robust_instant_policy.errors import RipError
@@ -29,8 +32,9 @@ from robust_instant_policy.serving.messages import (
     reply,
     unpack,
 )
-from robust_instant_policy.serving.planner import Job, Planner, QueueError
+from robust_instant_policy.serving.planner import CancelledPlanError, Job, Planner, QueueError
 
+logger = logging.getLogger(__name__)
 MAX_WAIT_S = 600.0  # for which one HTTP request may wait for its plan
 INTERNAL_ERROR = 1011  # close code
 
@@ -72,13 +76,18 @@ def _tell(error: BaseException, debug: bool) -> str:
 def _add_errors(app: FastAPI, debug: bool) -> None:
     """Every error is an object with one line, ``error``."""
 
-    @app.exception_handler(HTTPException)
-    async def refused(request: Request, error: HTTPException) -> JSONResponse:
-        return JSONResponse({"error": error.detail}, error.status_code)
+    @app.exception_handler(AnyHTTPException)
+    async def refused(request: Request, error: AnyHTTPException) -> JSONResponse:
+        return JSONResponse({"error": error.detail}, error.status_code, error.headers)
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        problems = [f"{'.'.join(map(str, one['loc'][1:])) or 'body'}: {one['msg']}" for one in error.errors()]
+        problems = [
+            f"the body is not JSON: {one['ctx']['error']}"
+            if one["type"] == "json_invalid"
+            else f"{'.'.join(map(str, one['loc'][1:])) or 'body'}: {one['msg']}"
+            for one in error.errors()
+        ]
         return JSONResponse({"error": excerpt("; ".join(problems))}, 422)
 
     @app.exception_handler(MessageError)
@@ -88,6 +97,10 @@ def _add_errors(app: FastAPI, debug: bool) -> None:
     @app.exception_handler(QueueError)
     async def busy(request: Request, error: QueueError) -> JSONResponse:
         return JSONResponse({"error": _tell(error, debug)}, 429)
+
+    @app.exception_handler(Exception)
+    async def unexpected(request: Request, error: Exception) -> JSONResponse:
+        return JSONResponse({"error": _tell(error, debug)}, 500)  # uvicorn logs it
 
 
 def _add_http(app: FastAPI, planner: Planner, debug: bool) -> None:
@@ -158,14 +171,18 @@ def _add_websocket(app: FastAPI, planner: Planner, debug: bool) -> None:
         try:
             await socket.accept()
             await socket.send_bytes(pack(describe(planner)))
-            await _converse(socket, planner)
+            await _converse(socket, planner, debug)
+        except WebSocketDisconnect:
+            return
         except Exception as error:
+            if not isinstance(error, RipError):
+                logger.exception("unexpected error in a websocket")
             await _end(socket, _tell(error, debug))
         finally:
             connections.discard(socket)
 
 
-async def _converse(socket: WebSocket, planner: Planner) -> None:
+async def _converse(socket: WebSocket, planner: Planner, debug: bool) -> None:
     """Answer one observation after the other until the client hangs up; raises what is wrong."""
     name = f"connection {secrets.token_hex(4)}"
     incoming = asyncio.ensure_future(socket.receive())
@@ -187,9 +204,13 @@ async def _converse(socket: WebSocket, planner: Planner) -> None:
                     if incoming.result()["type"] == "websocket.disconnect":
                         return
                     raise MessageError("a plan is under way; wait for its answer before the next observation")
-                await planned
             finally:
                 planner.cancel(job)  # without effect on one that has ended
+            if planned.cancelled():
+                raise CancelledPlanError("the plan was cancelled")
+            error = planned.exception()
+            if error is not None:  # the planner has logged what is unexpected
+                return await _end(socket, _tell(error, debug))
             await socket.send_bytes(pack(reply(planner, job)))
     finally:
         incoming.cancel()

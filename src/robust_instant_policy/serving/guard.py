@@ -12,7 +12,7 @@ from fastapi import HTTPException
 from starlette.responses import JSONResponse
 from starlette.websockets import WebSocket
 
-from robust_instant_policy.serving.address import is_loopback
+from robust_instant_policy.network import is_loopback
 
 SCHEME = "Api-Key "  # of the header Authorization, as openpi's client sends it
 OPEN_PATHS = ("/healthz", "/docs", "/openapi.json")  # they need no key
@@ -49,16 +49,19 @@ class Guard:
         await response(scope, receive, send)
 
     def _refusal(self, scope: Message) -> tuple[int, str] | None:
-        headers = {name.lower(): value.decode("latin-1") for name, value in scope["headers"]}
-        host, origin = headers.get(b"host", ""), headers.get(b"origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        headers = {name.lower(): value for name, value in scope["headers"]}
+        host, origin = (headers.get(name, b"").decode("latin-1") for name in (b"host", b"origin"))
+        try:
+            origin_netloc, hostname = urlsplit(origin).netloc, urlsplit(f"//{host}").hostname
+        except ValueError:
+            return 400, "the header Host or Origin holds no address"
+        if b"origin" in headers and origin_netloc != host:
             return 403, f"a page of {origin[:100]} may not use this server"
-        if is_loopback(self.host) and not is_loopback(urlsplit(f"//{host}").hostname or ""):
+        if is_loopback(self.host) and not is_loopback(hostname or ""):
             return 403, f"this server is at {self.host}, not at {host[:100]!r}"
-        given = headers.get(b"authorization", "")
         if self.key is None or scope["path"] in OPEN_PATHS:
             return None
-        if not hmac.compare_digest(given.encode(), (SCHEME + self.key).encode()):
+        if not hmac.compare_digest(headers.get(b"authorization", b""), (SCHEME + self.key).encode()):
             return 401, f"the header Authorization must be: {SCHEME}KEY"
         return None
 

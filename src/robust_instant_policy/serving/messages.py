@@ -31,6 +31,7 @@ SYNONYMS = {"image": "rgb"}
 PLAIN_DTYPE = re.compile(r"[<>|=]?[biuf][1248]")
 MAX_DIMENSIONS = 4
 MAX_NAME = 200  # characters of a robot's name
+MAX_UNIT_M = 1.0  # metres per step of depth
 OBSERVATION = {
     "rgb": "(H, W, 3) uint8",
     "depth": "(H, W) float metres, or whole numbers with depth_unit_m; 0 or NaN: no reading",
@@ -54,7 +55,7 @@ def unpack(message: bytes) -> dict[str, Any]:
     """The map in a message; nothing is unpickled. Raises `MessageError`."""
     try:
         content = msgpack.unpackb(message, object_hook=_unpack_array)
-    except (ValueError, TypeError, RecursionError, MemoryError, msgpack.UnpackException) as error:
+    except (ValueError, TypeError, ArithmeticError, RecursionError, MemoryError, msgpack.UnpackException) as error:
         raise MessageError(
             f"the message is not msgpack with NumPy arrays as openpi packs them: {_said(error)}"
         ) from None
@@ -124,10 +125,12 @@ def read_image(name: str, text: str) -> NDArray:
 def _metres(depth: NDArray, unit: object) -> NDArray:
     if depth.ndim == 3 and depth.shape[2] == 1:
         depth = depth[..., 0]
-    if depth.dtype.kind == "f":
+    if depth.dtype.kind not in "iu":
         return depth
-    if isinstance(unit, bool) or not isinstance(unit, int | float | np.number) or not 0 < unit < np.inf:
-        raise InvalidValueError("depth holds whole numbers; give depth_unit_m, metres per step (0.001: millimetres)")
+    if isinstance(unit, bool) or not isinstance(unit, int | float | np.number) or not 0 < unit <= MAX_UNIT_M:
+        raise InvalidValueError(
+            f"depth holds whole numbers; give depth_unit_m, metres per step, at most {MAX_UNIT_M:g} (0.001: mm)"
+        )
     return depth.astype(np.float32) * np.float32(unit)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 import threading
 import time
@@ -10,10 +11,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Literal
 
+from robust_instant_policy.checks import is_trusted
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import PlanningError, RipError
 from robust_instant_policy.policies import KeypointPolicy, Plan
 
+logger = logging.getLogger(__name__)
 MAX_WAITING = 64  # plans in the queue, the one under way included
 MAX_FINISHED = 64  # plans kept for clients that ask later
 
@@ -115,12 +118,19 @@ class Planner:
         """Cancel everything and end the thread."""
         for job in self.queue:
             self.cancel(job)
+        if self._current is not None:
+            logger.warning("a plan is under way; the server ends when its next sample has arrived")
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _carry_out(self, job: Job, observation: Observation) -> Plan:
         self._current, job.started_at = job, time.monotonic()
         try:
             plan = self.policy.plan(observation)
+        except RipError:
+            raise
+        except Exception:
+            logger.exception("unexpected error in a plan for %r", job.robot)
+            raise
         finally:
             self._current, job.ended_at = None, time.monotonic()
         if job.is_cancelled:
@@ -147,6 +157,6 @@ def require_confidence(plan: Plan, least: float) -> None:
     """Raises `RefusedPlanError` unless the plan has a confidence above 0 of at least ``least``."""
     if plan.confidence is None:
         raise RefusedPlanError("the plan is refused: its method gives no confidence")
-    if plan.confidence <= 0 or plan.confidence < least:
+    if not is_trusted(plan.confidence, least):
         why = "; ".join(("", *plan.notes))
         raise RefusedPlanError(f"the plan is refused: confidence {plan.confidence:.2f}, needed {least:.2f}{why}")

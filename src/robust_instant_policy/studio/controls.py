@@ -1,4 +1,4 @@
-"""Who holds the controls: one browser; the others look on."""
+"""Who holds the controls: one browser; the others watch."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Controls:
             elif event.client is not None and time.monotonic() - self._told.get(event.client_id, 0.0) > NOTE_S:
                 self._told[event.client_id] = time.monotonic()
                 event.client.add_notification(
-                    "You are looking on",
+                    "You are watching",
                     "Another browser holds the controls. Press “Take the controls” to have them.",
                     auto_close_seconds=NOTE_S,
                     color="yellow",
@@ -78,7 +78,7 @@ class Controls:
 
     def _offer(self, client: viser.ClientHandle) -> None:
         """Give ``client`` the button that takes the controls."""
-        button = client.gui.add_button("Take the controls (you are looking on)", color="yellow", order=-1.0)
+        button = client.gui.add_button("Take the controls (you are watching)", color="yellow", order=-1.0)
         self._buttons[client.client_id] = button
 
         async def take(_: Any) -> None:

@@ -1,10 +1,8 @@
-"""Geometry and markup that the page shows; nothing here knows the browser."""
+"""Geometry that the page shows; nothing here knows the browser."""
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import html
 import io
 from collections.abc import Sequence
 
@@ -13,8 +11,7 @@ import trimesh
 from PIL import Image
 
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.perception import KeypointExtractor
-from robust_instant_policy.policies import Context, LocatedScene, Plan
+from robust_instant_policy.policies import Plan
 from robust_instant_policy.studio.cell import Surface
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
@@ -24,14 +21,13 @@ TUBE_SIDES = 12
 TUBE_M = (0.003, 0.06)  # least and largest radius that is drawn
 DASH = 2  # steps of a dash, and of the gap behind it
 FOLLOWED, IGNORED = np.array([0, 110, 60]), np.array([255, 244, 170])  # colours of the weights 1 and 0
-KEYPOINT_COLOURS = ("#e6194b", "#3cb44b", "#ffe119", "#4363d8", "#f58231", "#911eb4", "#42d4f4", "#f032e6")
 
 
 def digest(surfaces: Sequence[Surface]) -> str:
     """Equal for equal ``surfaces``."""
     state = hashlib.blake2b(digest_size=16)
     for surface in surfaces:
-        for array in (surface.vertices, surface.faces, surface.colour, surface.texture):
+        for array in (surface.vertices, surface.faces, surface.colour, surface.uvs, surface.texture):
             state.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
     return state.hexdigest()
 
@@ -109,37 +105,3 @@ def tube(points: FloatArray, radii: FloatArray) -> tuple[FloatArray, np.ndarray]
         [corner[1], corner[1] + TUBE_SIDES, corner[0] + TUBE_SIDES],
     ]
     return vertices, np.concatenate([np.stack(face, axis=-1).reshape(-1, 3) for face in faces])
-
-
-def keypoint_picture(rgb: np.ndarray, context: Context | None = None, scene: LocatedScene | None = None) -> str:
-    """HTML of the start image, with the keypoints of ``scene``; the pointer on one tells what is known of it."""
-    height, width = rgb.shape[:2]
-    with io.BytesIO() as buffer:
-        Image.fromarray(rgb).save(buffer, "JPEG", quality=88)
-        data = base64.b64encode(buffer.getvalue()).decode()
-    marks = []
-    if context is not None and scene is not None:
-        size = width / 256
-        for index, (u, v) in enumerate(scene.located.pixels + 0.5):
-            told = html.escape(_known(context, scene, index))
-            colour = KEYPOINT_COLOURS[index % len(KEYPOINT_COLOURS)]
-            marks.append(
-                f'<g class="keypoint"><title>{told}</title><circle cx="{u:.1f}" cy="{v:.1f}" r="{5 * size:.1f}" '
-                f'fill="{colour}" stroke="#000" stroke-width="{size:.1f}"/><text x="{u:.1f}" y="{v + 2.4 * size:.1f}" '
-                f'font-size="{7 * size:.1f}" text-anchor="middle">{index}</text></g>'
-            )
-    return (
-        f'<svg viewBox="0 0 {width} {height}" style="width:100%;border-radius:6px">'
-        f'<image href="data:image/jpeg;base64,{data}" width="{width}" height="{height}"/>{"".join(marks)}</svg>'
-    )
-
-
-def _known(context: Context, scene: LocatedScene, index: int) -> str:
-    """What is known of a keypoint: its object, how sure it is here, and in the demonstrations."""
-    sure = f"here {scene.located.confidence[index]:.2f}"
-    if not isinstance(context.extractor, KeypointExtractor):
-        return f"keypoint {index}: confidence {sure}"
-    shown = ", ".join(f"{value:.2f}" for value in context.extractor.confidence_[:, index])
-    return (
-        f"keypoint {index} on object {context.extractor.object_of_[index]}: confidence {sure}; demonstrations {shown}"
-    )

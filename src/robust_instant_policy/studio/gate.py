@@ -7,16 +7,13 @@ address' path, so that it also stands in the address of the page's websocket.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hmac
-import ipaddress
 import re
 import secrets
 import socket
 import threading
-from concurrent.futures import Future
 
-from robust_instant_policy.errors import UsageError
+from robust_instant_policy.network import is_loopback, listen
 
 LONGEST_HEAD = 16_384  # bytes of a request before its body
 HEAD_TIMEOUT_S = 10.0
@@ -26,20 +23,21 @@ REFUSAL = "HTTP/1.1 403 Forbidden\r\nContent-Type: text/plain\r\nConnection: clo
 class Gate:
     """Listens on ``host`` and ``port`` and passes accepted connections on to the loopback port ``inner``.
 
-    ``address`` is what a person opens. Raises `UsageError` where the port is taken.
+    ``address`` is what a person opens. Raises `UsageError` where it cannot listen.
     """
 
     def __init__(self, host: str, port: int, inner: int):
-        self._host, self._inner = host, inner
+        self._host, self._inner = host.strip("[]"), inner
         self._token = "" if is_loopback(host) else secrets.token_urlsafe(16)
-        listening: Future[int] = Future()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run(port, listening)), daemon=True)
+        listener = listen(host, port)
+        self.port = listener.getsockname()[1]
+        running = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run(listener, running)), daemon=True)
         self._thread.start()
-        try:
-            self.port = listening.result()
-        except OSError as error:
-            raise UsageError(f"{host}:{port} cannot be listened on ({error.strerror}); choose another --port") from None
-        name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        running.wait()
+        name = f"[{self._host}]" if ":" in host else host
+        if self._host in ("0.0.0.0", "::"):
+            name = socket.gethostname()
         self.address = f"http://{name}:{self.port}/{self._token}".rstrip("/")
 
     def close(self) -> None:
@@ -47,14 +45,10 @@ class Gate:
         self._loop.call_soon_threadsafe(self._stopped.set)
         self._thread.join()
 
-    async def _run(self, port: int, listening: Future[int]) -> None:
+    async def _run(self, listener: socket.socket, running: threading.Event) -> None:
         self._loop, self._stopped = asyncio.get_running_loop(), asyncio.Event()
-        try:
-            server = await asyncio.start_server(self._serve, self._host, port)
-        except OSError as error:
-            listening.set_exception(error)
-            return
-        listening.set_result(server.sockets[0].getsockname()[1])
+        running.set()
+        server = await asyncio.start_server(self._serve, sock=listener)
         await self._stopped.wait()
         server.close()
 
@@ -78,15 +72,6 @@ class Gate:
             for end in (writer, inner):
                 if end is not None:
                     end.close()
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches ``host``."""
-    if host == "localhost":
-        return True
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return False
 
 
 def admit(head: str, token: str, loopback: bool) -> tuple[str, str]:

@@ -14,8 +14,11 @@ import viser
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.evaluation.scenes import stored_demonstrations
+from robust_instant_policy.errors import RipError, UsageError
+from robust_instant_policy.evaluation.scenes import SPLITS, stored_demonstrations
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.studio import markup
+from robust_instant_policy.studio.act_panel import ActPanel
 from robust_instant_policy.studio.cell import Cell
 from robust_instant_policy.studio.controls import Controls
 from robust_instant_policy.studio.plan_panel import PlanPanel
@@ -28,7 +31,6 @@ NOTE_S = 6.0
 KEY_REPEAT_S = 0.7  # a key that is held down comes again after less than that
 MANY = 1000  # demonstrations that are read at most
 BRAND = (46, 134, 171)
-BLUE, RED, GREEN, ORANGE, GREY = "#2e6f95", "#b3262e", "#2a7d3f", "#b35c00", "#5b6470"
 WAYS = {  # key: way in the view of the browser (right, away, up), and turn about the vertical
     "L": ((1, 0, 0), 0), "J": ((-1, 0, 0), 0), "I": ((0, 1, 0), 0), "K": ((0, -1, 0), 0),
     "U": ((0, 0, 1), 0), "O": ((0, 0, -1), 0), "N": ((0, 0, 0), 1), "M": ((0, 0, 0), -1),
@@ -67,6 +69,8 @@ class Page:
         self._gripped_at = 0.0
         self._dragged: int | None = None
         self._targets = np.zeros((0, 4, 4))  # at which the handles were put
+        self._phase = ""
+        self._opened = tasks[0]
         self._grippers: tuple[str, ...] = ()
         server.on_client_disconnect(self._forget_drag)
         self._gui.configure_theme(
@@ -80,16 +84,19 @@ class Page:
         self.tabs = self._gui.add_tab_group()
         with self.tabs.add_tab("Show", viser.Icon.HAND_MOVE):
             self._build()
-        self.plans = PlanPanel(
-            self._gui,
-            self._stage,
-            self.tabs,
-            self.session,
-            self._controls,
-            lambda: self.demonstrations,
-            self.on_message,
-            llm,
-        )
+        with self.tabs.add_tab("Plan", viser.Icon.BULB):
+            self.plans = PlanPanel(
+                self._gui,
+                self._stage,
+                self.session,
+                self._controls,
+                llm,
+                demonstrations=lambda: self.demonstrations,
+                new_scene=self._new_scene,
+                on_forget=lambda: self._acts.forget(),
+            )
+        with self.tabs.add_tab("Act", viser.Icon.PLAYER_PLAY):
+            self._acts = ActPanel(self._gui, server.scene, self.session, self._controls, self.plans)
         self._bind_keys()
         # Browsers run no script element that is added to a page, but the handler of an image that cannot be loaded.
         script = html.escape(GAMEPAD.read_text())
@@ -97,17 +104,16 @@ class Page:
 
     @property
     def folder(self) -> Path:
-        return self._folder_of(self._task.value)
+        return self._folder_of(self._opened)
 
     def open(self, task: str) -> None:
         """Replace the cell by that of ``task``."""
-        self._task.value = task
-        self._tell(GREY, f"Opening {task} …")
         self.session.post(lambda: self._open(task))
 
     def on_scene(self, cell: Cell, observation: Observation) -> None:
         self._stage.show_cell(cell)
         self.plans.show_scene(observation)
+        self._phase = ""  # objects have other places
         names = tuple(arm.name for arm in cell.arms)
         if names != self._grippers:
             self._grippers, self._arm, self._dragged = names, 0, None
@@ -120,6 +126,9 @@ class Page:
     def on_frame(self, poses: Mapping[str, FloatArray], tools: FloatArray, targets: FloatArray, status: Status) -> None:
         self._stage.show_poses(poses)
         self._stage.show_way(tools, targets, bool(status.refusal))
+        if status.phase != self._phase:
+            self._phase = status.phase
+            self._acts.show_movers()
         if self._targets.shape != targets.shape:
             self._targets = np.zeros_like(targets)
         for index, gizmo in enumerate(self._stage.gizmos):
@@ -144,7 +153,7 @@ class Page:
 
     def say_stopped(self) -> None:
         """Tell every browser that the server stops."""
-        self._tell(RED, "The studio was stopped. What you kept is on the disk; start it again with: rip studio")
+        self._tell(markup.RED, "The studio was stopped. What you kept is on the disk; start it again with: rip studio")
         self._server.flush()
 
     def _build(self) -> None:
@@ -160,7 +169,7 @@ class Page:
         discard = gui.add_button("Discard, begin again (X)", icon=viser.Icon.TRASH, color="gray")
         discard.on_click(held(lambda _: session.post(session.discard)))
         scene = gui.add_button("Another scene", icon=viser.Icon.DICE, color="gray")
-        scene.on_click(held(lambda _: session.post(lambda: session.new_scene((session.seed or 0) + 1))))
+        scene.on_click(held(lambda _: session.post(self._new_scene)))
 
     def _bind_keys(self) -> None:
         held, session = self._controls.held, self.session
@@ -177,12 +186,30 @@ class Page:
             self._gui.add_command(f"{name} ({key})", hotkey=key).on_trigger(held(action))
 
     def _open(self, task: str) -> None:
-        folder = self._folder_of(task)
-        self.demonstrations = stored_demonstrations(folder, task, MANY) if folder.exists() else []
-        seeds = [one.seed for one in self.demonstrations if one.seed is not None]
-        self._count()
-        first = max(seeds, default=-1) + 1
-        self.session.open(lambda: self._make_cell(task, self.demonstrations), first)
+        try:
+            self.session.require_no_recording()
+        except UsageError:
+            self._task.value = self._opened
+            raise
+        self._task.value = self._opened = task
+        self._tell(markup.GREY, f"Opening {task} …")
+        try:
+            folder = self.folder
+            self.demonstrations = stored_demonstrations(folder, task, MANY) if folder.exists() else []
+            self._count()
+            self.session.open(lambda: self._make_cell(task, self.demonstrations))
+            self._new_scene()
+        except Exception as error:
+            told = str(error) if isinstance(error, RipError) else "see the terminal"
+            self._tell(markup.RED, f"{task} cannot be opened: {told}")
+            raise
+
+    def _new_scene(self) -> None:
+        """Draw the scene after the present one and all demonstrated ones; the scenes of evaluations stay unseen."""
+        cell, now = self.session.cell, self.session.seed
+        seeds = [now] if cell is not None and not cell.arms else [now, *(one.seed for one in self.demonstrations)]
+        drawn = [seed for seed in seeds if seed is not None and seed < min(SPLITS.values())]
+        self.session.new_scene(max(drawn, default=-1) + 1)
 
     def _count(self) -> None:
         kept = len(self.demonstrations)
@@ -217,7 +244,7 @@ class Page:
     def _keep(self, event: Any) -> None:
         def keep() -> None:
             self.session.keep(self.folder)
-            self.session.new_scene((self.session.seed or 0) + 1)
+            self._new_scene()
 
         self.session.post(keep)
 
@@ -242,25 +269,26 @@ class Page:
     def _situation(self, status: Status) -> tuple[str, str]:
         """Colour and words for what goes on."""
         cell = self.session.cell
+        task, goal = (cell.description, cell.goal) if cell else ("", "")
         if status.refusal:
-            return ORANGE, f"Out of reach: {status.refusal}"
+            return markup.ORANGE, f"Out of reach: {status.refusal}"
         if cell is not None and not cell.arms:
-            return BLUE, f"{cell.description}: demonstrations of a folder. Choose a scene and press Plan."
+            return markup.BLUE, f"{task}. Choose a scene and press Plan."
         if status.phase == "ready":
-            return BLUE, f"Your turn: {cell.description if cell else ''}. Recording begins as you move the gripper."
+            what_next = "Move the gripper to record" + (", or press Plan." if self.demonstrations else ".")
+            return markup.BLUE, f"Your turn: {task}. {what_next}"
         if status.phase == "recording":
+            if status.is_full:
+                return markup.ORANGE, "The longest recording is reached: keep it (Enter), undo (Z), or discard it (X)."
             seconds = f"● Recording, {np.floor(status.seconds * 2) / 2:.1f} s. "
             if status.failure == "":
-                return GREEN, f"{seconds}Done: {cell.goal if cell else ''}. Press Enter to keep it."
-            return GREY, f"{seconds}Not done yet{': ' + status.failure if status.failure else ''}"
+                return markup.GREEN, f"{seconds}Done: {goal}. Press Enter to keep it."
+            return markup.GREY, f"{seconds}Not done yet{': ' + status.failure if status.failure else ''}"
         if status.phase == "playing":
-            return BLUE, "The arm executes the plan."
-        return GREY, "The scene was used. Begin again (X), or choose another scene."
+            return markup.BLUE, "The arm executes the plan."
+        return markup.GREY, "The plan has ended; nothing is recorded now. Begin again (X), or choose another scene."
 
     def _tell(self, colour: str, text: str) -> None:
-        told = (
-            f'<div id="studio-banner" style="background:{colour};color:#fff;font-size:1.02em;line-height:1.35;'
-            f'padding:0.6em 0.8em;margin:0.3em 0.5em;border-radius:6px">{html.escape(text)}</div>'
-        )
+        told = markup.box(colour, text, "studio-banner")
         if told != self._told:
             self._told = self._banner.content = told

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -133,7 +134,7 @@ class Planner:
         threading.Thread(target=self._work, args=work, name="planner", daemon=True).start()
 
     def cancel(self, reason: str = "cancelled") -> None:
-        """End planning for ``reason``; a stage that is under way ends unheard."""
+        """End planning for ``reason``; the result of a stage that is under way is dropped."""
         self._job += 1
         self._on_end(reason)
 
@@ -158,9 +159,14 @@ class Planner:
             self._on_end("")
         except Cancelled:
             pass
-        except RipError as error:
+        except Exception as error:
+            if isinstance(error, RipError):
+                reason = str(error)
+            else:  # such as a fault inside a model's library
+                traceback.print_exc()
+                reason = f"unexpected {type(error).__name__}: {error}; see the terminal"
             if job == self._job:
-                self._on_end(str(error))
+                self._on_end(reason)
 
     def _plan(
         self,

@@ -28,16 +28,19 @@ class RecordedCell:
 
     def __init__(self, name: str, demonstrations: Sequence[Demonstration], observation: Observation | None):
         self.task = self.description = name
-        seen = [] if observation is None else [observation]
-        self._scenes = [*seen, *(one.observation for one in demonstrations)]
-        if not self._scenes:
-            raise UsageError(f"{name} holds no demonstrations; record some first")
+        if not demonstrations:
+            raise UsageError(f"{name} has no demonstrations; give a folder with --demos, or record some")
+        new = {} if observation is None else {"new observation": observation}
+        seen = {f"demonstration {index}": one.observation for index, one in enumerate(demonstrations, 1)}
+        self._scenes = [*new.items(), *seen.items()]
         self.triangle = GripperTriangle.from_triplets(
             np.concatenate([one.trajectory.triplets.reshape(-1, 3, 3) for one in demonstrations])
         )
 
     def reset(self, seed: int) -> Observation:
-        return self._scenes[seed % len(self._scenes)]
+        name, observation = self._scenes[seed % len(self._scenes)]
+        self.description = f"{self.task}: {name}"
+        return observation
 
     def move(self, body: str, pose: FloatArray) -> Observation:
         raise UsageError("a photographed scene cannot be changed")

@@ -18,6 +18,7 @@ from robust_instant_policy.studio.cell import Cell
 from robust_instant_policy.studio.gate import Gate
 from robust_instant_policy.studio.page import Page
 from robust_instant_policy.studio.recorded import RecordedCell
+from robust_instant_policy.studio.session import Session
 from robust_instant_policy.studio.simulated import SimulatedCell
 from robust_instant_policy.tasks import TASK_NAMES, is_installed
 
@@ -35,7 +36,7 @@ class Choice:
     demos: Path | None
     data: Path
     llm: str = "embedded"
-    observation: Path | None = None
+    observation: Observation | None = None
 
     def folder(self, task: str) -> Path:
         return self.demos if self.demos is not None and task == self.task else self.data / task
@@ -43,8 +44,7 @@ class Choice:
     def cell(self, task: str, demonstrations: Sequence[Demonstration]) -> Cell:
         if (is_own(task) or is_installed(task)) and (self.observation is None or task != self.task):
             return SimulatedCell(task)
-        seen = None if self.observation is None else Observation.load(self.observation)
-        return RecordedCell(task, demonstrations, seen)
+        return RecordedCell(task, demonstrations, self.observation if task == self.task else None)
 
 
 @contextlib.contextmanager
@@ -70,16 +70,30 @@ def studio(choice: Choice, host: str, port: int) -> Iterator[tuple[Page, str]]:
 
 
 def serve(choice: Choice, host: str, port: int) -> None:
-    """Serve the studio until Ctrl-C."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    """Serve the studio until Ctrl-C or SIGTERM."""
+    with studio(choice, host, port) as (page, address), _stop_by_signal(page.session):
+        print(f"rip studio: {address}\nOpen this address in a browser; Ctrl-C stops the studio.", flush=True)
+        try:
+            page.session.run()
+        finally:
+            page.session.close()
+        print("rip studio: stopped; what was kept is on the disk", flush=True)
+
+
+@contextlib.contextmanager
+def _stop_by_signal(session: Session) -> Iterator[None]:
+    """Ctrl-C and SIGTERM stop ``session`` once its present work is done: simulators do not bear an exception while
+    they load. The second signal raises `KeyboardInterrupt`."""
+    numbers = signal.SIGINT, signal.SIGTERM
+
+    def stop(*_: object) -> None:
+        session.stop()
+        for number in numbers:
+            signal.signal(number, signal.default_int_handler)
+
+    before = [signal.signal(number, stop) for number in numbers]
     try:
-        with studio(choice, host, port) as (page, address):
-            print(f"rip studio: {address}\nOpen this address in a browser; Ctrl-C stops the studio.", flush=True)
-            try:
-                page.session.run()
-            except KeyboardInterrupt:
-                print("rip studio: stopped; what was kept is on the disk", flush=True)
-            finally:
-                page.session.close()
+        yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)

@@ -36,12 +36,13 @@ Job = Callable[[], None]
 class Status:
     """``phase`` is "empty" (no cell), "ready" (a scene in which nothing moved), "recording", "playing" or "done".
 
-    ``seconds`` were recorded; ``refusal`` says why a target is not followed, empty where it is; ``failure`` as in
-    `Cell`; ``closed`` are the gripper states that were asked for.
+    ``seconds`` were recorded; ``is_full`` says that they are the most that may be; ``refusal`` why a target is not
+    followed, empty where it is; ``failure`` is as in `Cell`; ``closed`` are the gripper states that were asked for.
     """
 
     phase: str = "empty"
     seconds: float = 0.0
+    is_full: bool = False
     refusal: str = ""
     failure: str | None = None
     closed: tuple[bool, ...] = ()
@@ -73,7 +74,7 @@ class Session:
         self.observation: Observation | None = None
         self.seed: int | None = None
         self.status = Status()
-        self._watcher = watcher
+        self.watcher = watcher
         self._jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
         self._stopped = False
         self._take = Take()
@@ -89,7 +90,9 @@ class Session:
         self._jobs.put(job)
 
     def stop(self) -> None:
-        self.post(self._stop)
+        """Have `run` return after the jobs that were posted; may be called by a signal handler."""
+        self._stopped = True
+        self.post(lambda: None)
 
     def run(self) -> None:
         """Run the cell, and the jobs, until `stop`."""
@@ -110,22 +113,29 @@ class Session:
             if now - shown > 1 / FRAME_HZ:
                 shown = now
                 self._show()
+        self._work(0.0)
 
     def close(self) -> None:
         if self.cell is not None:
             self.cell.close()
-            self.cell, self.status = None, Status()
+            self.cell, self.seed, self.status = None, None, Status()
 
-    def open(self, make_cell: Callable[[], Cell], seed: int) -> None:
-        """Replace the cell, and draw the scene of ``seed``."""
+    def open(self, make_cell: Callable[[], Cell]) -> None:
+        """Replace the cell; `new_scene` draws its first scene. Raises `UsageError` while recording."""
+        self.require_no_recording()
         self.close()
         self.cell = make_cell()
-        self.new_scene(seed)
 
     def new_scene(self, seed: int) -> None:
-        """Draw the scene of ``seed``; what was not kept is lost."""
+        """Draw the scene of ``seed``; raises `UsageError` while recording."""
+        self.require_no_recording()
         self._moved.clear()
         self._draw(seed)
+
+    def require_no_recording(self) -> None:
+        """Raise `UsageError` where going on would lose a recording."""
+        if self.status.phase == "recording":
+            raise UsageError("a demonstration is being recorded; keep it (Enter) or discard it (X) first")
 
     def move(self, body: str, pose: FloatArray) -> None:
         """Put a body of a scene in which nothing moved so far to ``pose (4, 4)``."""
@@ -134,7 +144,7 @@ class Session:
         self._moved[body] = pose
         assert self.cell is not None
         self.observation = self.cell.move(body, pose)
-        self._watcher.on_scene(self.cell, self.observation)
+        self.watcher.on_scene(self.cell, self.observation)
 
     def aim(self, arm: int, pose: FloatArray) -> None:
         """Let an arm follow the target ``pose (4, 4)``."""
@@ -207,10 +217,15 @@ class Session:
         with DatasetWriter(folder, task=cell.task, description=cell.description, rate_hz=rate_hz) as writer:
             writer.add(demonstration)
             count = writer.num_episodes
-        self._watcher.on_kept(demonstration, folder, count)
+        self._set(phase="done", is_full=False)
+        self.watcher.on_kept(demonstration, folder, count)
 
     def play(self, motion: Motion, on_played: Callable[[str | None], None]) -> None:
-        """Let the arms run ``motion``, which begins at home; ``on_played`` receives `Cell.failure` at the end."""
+        """Let the arms run ``motion``, which begins at home; ``on_played`` receives `Cell.failure` at the end.
+
+        Raises `UsageError` while recording.
+        """
+        self.require_no_recording()
         if self.status.phase != "ready":
             self.discard()
         self._queue(motion)
@@ -219,21 +234,33 @@ class Session:
         self._follower.resume(motion)
         self._set(phase="playing")
 
-    def rehearse(self, motion: Motion) -> str | None:
-        """Run ``motion``, which begins at home, at once and from the beginning of the scene; returns `Cell.failure`."""
+    def rehearse(self, motion: Motion, is_stopped: Callable[[], bool]) -> str | None:
+        """Run ``motion``, which begins at home, at once and from the beginning of the scene, until ``is_stopped``.
+
+        Returns `Cell.failure`. Raises `UsageError` while recording.
+        """
+        self.require_no_recording()
         self._draw(self.seed)
         assert self.cell is not None
         for command in motion.commands:
+            if is_stopped() or self._stopped:
+                break
             self.cell.advance(command)
         return self.cell.failure()
 
-    def abort(self) -> None:
-        """Stop a plan that is being played."""
-        if self.status.phase == "playing":
-            self._steps.clear()
-
-    def _stop(self) -> None:
-        self._stopped = True
+    def abort(self) -> bool:
+        """Stop the motion that is being played where the arms are; returns whether there was one."""
+        if self.status.phase != "playing":
+            return False
+        assert self._follower is not None
+        motion = self._follower.motion
+        done = max(len(motion.poses) - len(self._steps), 1)
+        self._follower.resume(
+            Motion(motion.joints[:done], motion.fingers[:done], motion.poses[:done], motion.closed[:done])
+        )
+        self._on_played = None
+        self._played()
+        return True
 
     def _work(self, seconds: float) -> None:
         """Call the jobs that are there, waiting ``seconds`` for the first."""
@@ -243,10 +270,10 @@ class Session:
                 try:
                     job()
                 except RipError as error:
-                    self._watcher.on_message(str(error))
+                    self.watcher.on_message(str(error))
                 except Exception as error:  # a fault of one action must not end the session
                     traceback.print_exc()
-                    self._watcher.on_message(f"unexpected {type(error).__name__}: {error}; see the terminal")
+                    self.watcher.on_message(f"unexpected {type(error).__name__}: {error}; see the terminal")
                 job = self._jobs.get_nowait()
         except queue.Empty:
             pass
@@ -265,7 +292,7 @@ class Session:
             self._follower = Follower(cell.arms, cell.control_hz)
             self._targets = self._follower.motion.poses[-1].copy()
         self.status = Status("ready", closed=tuple(self._closed), failure=cell.failure())
-        self._watcher.on_scene(cell, self.observation)
+        self.watcher.on_scene(cell, self.observation)
         self._show()
 
     def _is_operated(self) -> bool:
@@ -276,6 +303,8 @@ class Session:
         assert self.cell is not None
         assert self._follower is not None
         phase = self.status.phase
+        if self.status.is_full:
+            return  # the cell waits for the recording to be kept, cut or discarded
         if not self._steps and phase == "playing":
             self._played()
             return
@@ -299,10 +328,7 @@ class Session:
         if phase == "recording":
             self._take.append(command, poses, closed)
             seconds = len(self._take) / self.cell.control_hz
-            self._set(phase=phase, seconds=seconds)
-            if seconds > LONGEST_TAKE_S:
-                self.discard()
-                self._watcher.on_message(f"discarded: a demonstration may take {LONGEST_TAKE_S:.0f} s")
+            self._set(phase=phase, seconds=seconds, is_full=seconds >= LONGEST_TAKE_S)
 
     def _queue(self, motion: Motion) -> None:
         self._steps.extend(zip(motion.commands, motion.poses, motion.closed, strict=True))
@@ -310,6 +336,7 @@ class Session:
     def _played(self) -> None:
         assert self.cell is not None
         assert self._follower is not None
+        self._steps.clear()
         self._targets = self._follower.motion.poses[-1].copy()
         self._closed = self._follower.motion.closed[-1].copy()
         self._set(phase="done", failure=self.cell.failure())
@@ -323,4 +350,4 @@ class Session:
     def _show(self) -> None:
         assert self.cell is not None
         self._set(closed=tuple(map(bool, self._closed)))
-        self._watcher.on_frame(self.cell.poses(), self.cell.tool_poses(), self._targets, self.status)
+        self.watcher.on_frame(self.cell.poses(), self.cell.tool_poses(), self._targets, self.status)

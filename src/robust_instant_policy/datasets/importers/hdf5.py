@@ -46,8 +46,8 @@ def has(group: Any, name: str) -> bool:
     return isinstance(group, h5py.Group) and name in group
 
 
-def read(group: Any, name: str, ndim: int) -> NDArray | None:
-    """The array ``name`` of numbers of a group, or None if it is missing.
+def read(group: Any, name: str, *ndim: int) -> NDArray | None:
+    """The array ``name`` of numbers of a group, with ``ndim`` dimensions, or None if it is missing.
 
     Raises `DatasetError` for an array of other dimensions or type, an empty or too large one, and one that is stored
     in another file.
@@ -62,8 +62,9 @@ def read(group: Any, name: str, ndim: int) -> NDArray | None:
         raise DatasetError(f"{where} is not an array of numbers")
     if data.is_virtual or data.external:
         raise DatasetError(f"{where} is stored in another file; copy its content into this one")
-    if data.ndim != ndim or not data.size:
-        raise DatasetError(f"{where} must have {ndim} dimensions and not be empty, got {data.shape}")
+    if data.ndim not in ndim or not data.size:
+        wanted = " or ".join(map(str, ndim))
+        raise DatasetError(f"{where} must have {wanted} dimensions and not be empty, got {data.shape}")
     if data.nbytes > MAX_ARRAY_BYTES:
         raise DatasetError(f"{where} is larger than {MAX_ARRAY_BYTES >> 30} GiB, its header says {data.shape}")
     return data[()]
@@ -109,5 +110,5 @@ def choose_camera(path: Path, cameras: Sequence[str], wanted: str | None) -> str
         return cameras[0] if cameras else None
     if wanted not in cameras:
         problem = "has several cameras" if wanted is None else f"has no camera {wanted!r}"
-        raise DatasetError(f"{path} {problem}; give camera= one of: {excerpt(', '.join(cameras)) or 'none'}")
+        raise DatasetError(f"{path} {problem}; give camera, one of: {excerpt(', '.join(cameras)) or 'none'}")
     return wanted

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from robust_instant_policy.checks import checked_pose, checked_positive
+from robust_instant_policy.datasets.importers.layouts import MAX_ANGLE_RAD, arm_of
 from robust_instant_policy.errors import DatasetError, MissingExtraError
 from robust_instant_policy.files import excerpt, read_regular
 from robust_instant_policy.geometry import FloatArray
@@ -23,8 +25,9 @@ class JointModel:
 
     ``urdf`` describes it; ``link`` is the one whose poses are wanted, in the URDF's base frame. ``names`` are the
     URDF's joints in the order of ``columns``, the names of the recording's columns; without them both are those
-    that the URDF and the recording have in common. A step of a column is ``unit_rad`` radians (0.01745: degrees), or
-    metres.
+    that the URDF and the recording have in common. A step of an angle is ``unit_rad`` radians (0.01745: degrees);
+    sliding joints are in metres. ``base (4, 4)`` is the pose of the URDF's base in the world, by default its origin.
+    Raises `InvalidValueError` for another ``base`` or unit.
     """
 
     urdf: Path
@@ -32,45 +35,84 @@ class JointModel:
     names: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     unit_rad: float = 1.0
+    base: FloatArray | None = None
 
-    def poses(self, names: Sequence[str], values: FloatArray) -> FloatArray:
-        """Poses ``(T, 4, 4)`` of the link for ``values (T, D)`` in columns called ``names``. Raises `DatasetError`."""
+    def __post_init__(self) -> None:
+        checked_positive("unit_rad", self.unit_rad)
+        if self.base is not None:
+            checked_pose("base", self.base)
+
+    def poses(self, names: Sequence[str], values: FloatArray, arm: str = "") -> FloatArray:
+        """Poses ``(T, 4, 4)`` of the link for ``values (T, D)`` in columns called ``names``, of one ``arm`` of two
+        ("left", "right"). Raises `DatasetError`.
+        """
         try:
             import mink
             import mujoco
         except ImportError as error:
             raise MissingExtraError(error.name or "mink", "robots") from error
         model = _load(mujoco, self.urdf)
-        joints = [model.joint(index).name for index in range(model.njnt)]
-        chosen = self._pairs(names, joints)
         if not _has(mujoco, model, self.link):
             links = ", ".join(model.body(index).name for index in range(1, model.nbody))
             raise DatasetError(f"{self.urdf} has no link {self.link!r}; it has: {excerpt(links)}")
+        chosen = self._pairs(names, [model.joint(index).name for index in range(model.njnt)], arm)
+        lacking = [joint for joint in _moving(model, self.link) if joint not in chosen]
+        if lacking:
+            raise DatasetError(
+                f"the recording has no column for {excerpt(', '.join(lacking))}, which moves {self.link!r}; pair them "
+                "with names and columns, or make the joint fixed in the URDF"
+            )
+        steps = {joint: self._unit(mujoco, model.joint(joint), values[:, column]) for joint, column in chosen.items()}
         configuration = mink.Configuration(model)
         poses = np.empty((len(values), 4, 4))
         q = configuration.q.copy()
         for row, pose in zip(values, poses, strict=True):
-            for column, joint in chosen:
-                q[model.joint(joint).qposadr[0]] = row[column] * self.unit_rad
+            for joint, column in chosen.items():
+                q[model.joint(joint).qposadr[0]] = row[column] * steps[joint]
             configuration.update(q)
             pose[:] = configuration.get_transform_frame_to_world(self.link, "body").as_matrix()
-        return poses
+        return poses if self.base is None else self.base @ poses
 
-    def _pairs(self, names: Sequence[str], joints: Sequence[str]) -> list[tuple[int, str]]:
-        """Column and joint, for every joint whose position is known."""
+    def _pairs(self, names: Sequence[str], joints: Sequence[str], arm: str) -> dict[str, int]:
+        """The column of every joint whose position is known."""
         columns = self.columns or tuple(names)
         if self.names and len(self.names) == len(columns):
-            wanted = dict(zip(columns, self.names, strict=True))
+            wanted = dict(zip(self.names, columns, strict=True))
         else:
-            wanted = {name: _stem(name) for name in columns if _stem(name) in joints}
-        pairs = [(names.index(column), joint) for column, joint in wanted.items() if column in names]
-        unknown = [joint for _, joint in pairs if joint not in joints]
+            wanted = {}
+            for name in columns:
+                bare = _stem(name) if arm_of(name) in ("", arm) else ""
+                for joint in (bare, bare.removeprefix(f"{arm}_"), bare.removesuffix(f"_{arm}")):
+                    if joint in joints:
+                        wanted.setdefault(joint, name)
+        pairs = {joint: names.index(column) for joint, column in wanted.items() if column in names}
+        unknown = [joint for joint in pairs if joint not in joints]
         if not pairs or unknown or (self.names and len(pairs) != len(self.names)):
             raise DatasetError(
                 f"the joints of {self.urdf} ({excerpt(', '.join(joints))}) are not those of the recording "
-                f"({excerpt(', '.join(names))}); give names= and columns= in the same order"
+                f"({excerpt(', '.join(names))}); give names and columns in the same order"
             )
         return pairs
+
+    def _unit(self, mujoco: Any, joint: Any, values: FloatArray) -> float:
+        """Radians or metres per step of ``values``. Raises `DatasetError` where they are no angles in that unit."""
+        if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
+            return 1.0
+        if (largest := np.abs(values).max() * self.unit_rad) > MAX_ANGLE_RAD:
+            raise DatasetError(
+                f"the angles of {joint.name} reach {largest:.0f} rad; in degrees? Set unit_rad of joints to 0.017453"
+            )
+        return self.unit_rad
+
+
+def _moving(model: Any, link: str) -> list[str]:
+    """Names of the joints between the base and ``link``."""
+    body, joints = model.body(link).id, []
+    while body:
+        first = model.body_jntadr[body]
+        joints += [model.joint(index).name for index in range(first, first + model.body_jntnum[body])]
+        body = model.body_parentid[body]
+    return joints
 
 
 def _stem(name: str) -> str:

@@ -3,10 +3,12 @@
 A pose is x, y, z in any unit of length and a rotation, in one of `ROTATIONS`:
 
 - ``rotvec``: a rotation vector (axis times angle), named wx wy wz, rx ry rz, ax ay az or axis_angle1 … 3;
+- ``axis_angle``: a unit vector, named like a rotation vector, and the angle;
 - ``rpy``: roll, pitch, yaw about the fixed axes x, y, z in this order, R = Rz(yaw) Ry(pitch) Rx(roll);
 - ``quat_xyzw``, ``quat_wxyz``: a quaternion, named qx qy qz qw, or rx ry rz rw, in any order.
 
-Names may have any prefix; ``left`` and ``right`` in it tell two arms apart.
+Names may have any prefix; ``left`` and ``right`` in it tell two arms apart. Those of velocities, forces and differences
+are no pose.
 """
 
 from __future__ import annotations
@@ -23,31 +25,41 @@ from scipy.spatial.transform import Rotation
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.geometry import FloatArray
 
-ROTATIONS = {"rotvec": 3, "rpy": 3, "quat_xyzw": 4, "quat_wxyz": 4}  # kind, and how many numbers
+ROTATIONS = {"rotvec": 3, "rpy": 3, "axis_angle": 4, "quat_xyzw": 4, "quat_wxyz": 4}  # kind, and how many numbers
 MIN_QUATERNION = 1e-6  # shorter quaternions have no direction
 FARTHEST_M = 20.0  # from the origin; farther, positions are not in metres
+MAX_ANGLE_RAD = 4 * np.pi  # larger angles are not in radians
+UNIT_TOLERANCE = 0.02  # of the length of an axis from 1
 DOWN = -0.5  # height of a unit vector within 60 degrees of straight down
 ARMS = ("left", "right")
-WORD = re.compile(r"[a-z]+|[0-9]+")
+WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
+NO_POSE = {  # words in names of other vectors
+    "vel", "velocity", "twist", "force", "torque", "wrench", "acc", "acceleration", "delta", "rel", "relative", "error",
+}  # fmt: skip
 POSITION = ("x", "y", "z")
+QUATERNION_KINDS = ("quat_xyzw", "quat_wxyz")
 # By the words at the end of a name, longest first: the axis that they mean.
 SPELLINGS: dict[tuple[str, ...], str] = {
     **{(axis,): axis for axis in (*POSITION, "wx", "wy", "wz", "rx", "ry", "rz", "rw", "qx", "qy", "qz", "qw")},
-    **{(name,): name for name in ("roll", "pitch", "yaw")},
+    **{(name,): name for name in ("roll", "pitch", "yaw", "angle")},
     **{(f"a{axis}",): f"w{axis}" for axis in POSITION},
     **{(word, axis): f"q{axis}" for word in ("quat", "quaternion") for axis in ("x", "y", "z", "w")},
-    **{(word, axis): f"w{axis}" for word in ("rotvec", "angle") for axis in POSITION},
+    **{(word, str(place)): f"q{place}" for word in ("quat", "quaternion") for place in range(4)},
+    **{(word, axis): f"r{axis}" for word in ("rot", "rotation", "orientation") for axis in ("x", "y", "z", "w")},
+    **{(word, axis): f"w{axis}" for word in ("rotvec", "axis", "angle") for axis in POSITION},
     **{("axis", "angle", str(number)): f"w{axis}" for number, axis in enumerate(POSITION, 1)},
 }
 TRIPLES = {"rotvec": (("wx", "wy", "wz"), ("rx", "ry", "rz")), "rpy": (("roll", "pitch", "yaw"),)}
 QUATERNIONS = (("qx", "qy", "qz", "qw"), ("rx", "ry", "rz", "rw"))
+NUMBERED = ("q0", "q1", "q2", "q3")  # a quaternion in an unknown order
 
 
 @dataclass(frozen=True)
 class Columns:
     """The columns of one arm's pose: three of the position, and those of a rotation of the kind ``rotation``.
 
-    Those of a quaternion are in the order x, y, z, w; ``rotation`` is empty where their order is unknown.
+    Those of a quaternion are in the order x, y, z, w, those of an axis with its angle begin with the axis; ``rotation``
+    is empty for a quaternion whose order is unknown.
     """
 
     arm: str
@@ -58,20 +70,27 @@ class Columns:
 
 def axis_names(feature: Mapping[str, Any]) -> list[str]:
     """Names of a vector's axes: a list, lists by kind of motor, or a map from the name to the column."""
-    names = feature.get("names") or []
+    return _names(feature.get("names"))
+
+
+def _names(names: object) -> list[str]:
+    if isinstance(names, str):
+        return [names]
     if isinstance(names, Mapping):
-        if all(isinstance(column, int) for column in names.values()):
-            names = sorted(names, key=lambda name: names[name])
-        else:
-            names = [name for group in names.values() if isinstance(group, list) for name in group]
-    if isinstance(names, list) and len(names) == 1 and isinstance(names[0], list):
-        names = names[0]
-    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+        if names and all(isinstance(column, int) for column in names.values()):
+            return [str(name) for name, _ in sorted(names.items(), key=lambda pair: pair[1])]
+        names = list(names.values())
+    return [name for part in names for name in _names(part)] if isinstance(names, list) else []
+
+
+def words_of(name: str) -> tuple[str, ...]:
+    """The words in a name, such as ``left_ee.posX``, in lower case."""
+    return tuple(word.lower() for word in WORD.findall(name))
 
 
 def arm_of(name: str) -> str:
     """ "left" or "right" where a name says so, else empty."""
-    words = WORD.findall(name.lower())
+    words = words_of(name)
     return next((arm for arm in ARMS if arm in words), "")
 
 
@@ -91,24 +110,32 @@ def pose_columns(names: Sequence[str], rotation: str | None = None) -> list[Colu
 
 
 def gripper_columns(names: Sequence[str]) -> dict[str, int]:
-    """The first column whose name speaks of a gripper, by arm."""
+    """The first column whose name speaks of a gripper, not of its pose, by arm."""
     found: dict[str, int] = {}
     for column, name in enumerate(names):
-        if "gripper" in name.lower():
-            found.setdefault(arm_of(name), column)
+        if is_gripper(name) and _axis(name) is None:
+            found.setdefault("" if "finger" in name.lower() else arm_of(name), column)
     return found
 
 
+def is_gripper(name: str) -> bool:
+    """Whether a name is that of a gripper's position or command."""
+    return any(word in name.lower() for word in ("gripper", "finger")) and not NO_POSE & set(words_of(name))
+
+
 def unnamed_columns(size: int, rotation: str | None) -> Columns | None:
-    """A vector of 6 or 7 numbers without names as a pose; None where the kind of rotation is not known."""
+    """A vector of numbers without names as a pose; None where the kind of rotation is not known."""
     if rotation is not None:
         return Columns("", (0, 1, 2), _in_xyzw(tuple(range(3, 3 + ROTATIONS[rotation])), rotation), rotation)
-    return Columns("", (0, 1, 2), (3, 4, 5, 6), "") if size == 7 else None
+    return Columns("", (0, 1, 2), (3, 4, 5, 6), "") if size in (7, 8) else None  # 8: with the gripper
 
 
 def _axis(name: str) -> str | None:
-    words = tuple(WORD.findall(name.lower()))
-    return next((SPELLINGS[words[-n:]] for n in (3, 2, 1) if words[-n:] in SPELLINGS), None)
+    words = words_of(name)
+    if NO_POSE & set(words):
+        return None
+    axis = next((SPELLINGS[words[-n:]] for n in (3, 2, 1) if words[-n:] in SPELLINGS), None)
+    return None if axis == "angle" and is_gripper(name) else axis
 
 
 def _columns(arm: str, axes: Mapping[str, list[int]], rotation: str | None) -> Columns | None:
@@ -122,6 +149,10 @@ def _columns(arm: str, axes: Mapping[str, list[int]], rotation: str | None) -> C
     for quaternion in QUATERNIONS:
         if (turns := columns(quaternion)) is not None:
             return Columns(arm, position, turns, "quat_xyzw")
+    if (turns := columns(NUMBERED)) is not None:
+        return Columns(arm, position, _in_xyzw(turns, rotation), rotation if rotation in QUATERNION_KINDS else "")
+    if rotation in (None, "axis_angle") and (turns := columns(("wx", "wy", "wz", "angle"))) is not None:
+        return Columns(arm, position, turns, "axis_angle")
     for kind, spellings in TRIPLES.items():
         for spelling in spellings:
             if (turns := columns(spelling)) is not None:
@@ -129,26 +160,45 @@ def _columns(arm: str, axes: Mapping[str, list[int]], rotation: str | None) -> C
     return None
 
 
-def _in_xyzw(turns: tuple[int, ...], rotation: str) -> tuple[int, ...]:
+def _in_xyzw(turns: tuple[int, ...], rotation: str | None) -> tuple[int, ...]:
     return (*turns[1:], turns[0]) if rotation == "quat_wxyz" else turns
 
 
-def rotations_of(name: str, turns: NDArray, rotation: str) -> FloatArray:
-    """Matrices ``(T, 3, 3)`` of ``turns (T, 3 or 4)``, quaternions as x, y, z, w. Raises `DatasetError`."""
+def rotations_of(name: str, turns: NDArray, rotation: str, unit_rad: float = 1.0) -> FloatArray:
+    """Matrices ``(T, 3, 3)`` of ``turns (T, 3 or 4)``, quaternions as x, y, z, w; angles are in steps of ``unit_rad``.
+
+    Raises `DatasetError`.
+    """
     turns = turns.astype(np.float64)
+    if rotation in QUATERNION_KINDS:
+        if np.linalg.norm(turns, axis=1).min() < MIN_QUATERNION:
+            raise DatasetError(f"{name}: quaternions must have length 1, and one is 0")
+        return Rotation.from_quat(turns).as_matrix()
+    angles = turns[:, 3:] if rotation == "axis_angle" else turns
+    if (largest := np.abs(angles).max() * unit_rad) > MAX_ANGLE_RAD:
+        raise DatasetError(
+            f"{name}: angles reach {largest:.0f} rad; in degrees? Set rotation_unit_rad to 0.017453 in the rig"
+        )
     if rotation == "rpy":
-        return Rotation.from_euler("xyz", turns).as_matrix()
+        return Rotation.from_euler("xyz", turns * unit_rad).as_matrix()
     if rotation == "rotvec":
-        return Rotation.from_rotvec(turns).as_matrix()
-    if np.linalg.norm(turns, axis=1).min() < MIN_QUATERNION:
-        raise DatasetError(f"{name}: quaternions must have length 1, and one is 0")
-    return Rotation.from_quat(turns).as_matrix()
+        return Rotation.from_rotvec(turns * unit_rad).as_matrix()
+    lengths = np.linalg.norm(turns[:, :3], axis=1)
+    if np.abs(lengths[angles[:, 0] != 0] - 1).max(initial=0) > UNIT_TOLERANCE:
+        raise DatasetError(f"{name}: the axes of its rotations do not have length 1; set rotation in the rig, rotvec")
+    return Rotation.from_rotvec(turns[:, :3] * angles * unit_rad).as_matrix()
 
 
 def poses_of(
-    name: str, numbers: NDArray, columns: Columns, unit_m: float = 1.0, tool: NDArray | None = None
+    name: str,
+    numbers: NDArray,
+    columns: Columns,
+    unit_m: float = 1.0,
+    unit_rad: float = 1.0,
+    tool: NDArray | None = None,
 ) -> FloatArray:
-    """Poses ``(T, 4, 4)`` in ``columns`` of ``numbers (T, D)``; positions are in steps of ``unit_m`` metres.
+    """Poses ``(T, 4, 4)`` in ``columns`` of ``numbers (T, D)``; positions are in steps of ``unit_m`` metres, angles of
+    ``unit_rad`` radians.
 
     A quaternion of unknown order is read in the one in which the approach direction (z of the ``tool``) makes sense:
     it points down. Raises `DatasetError` that begins with ``name`` if they are not poses, and where both orders
@@ -162,11 +212,11 @@ def poses_of(
     farthest = float(np.abs(poses[:, :3, 3]).max())
     if farthest > FARTHEST_M:
         raise DatasetError(
-            f"{name}: positions reach {farthest:.0f} m; are they in millimetres? Give position_unit_m=0.001 in the Rig"
+            f"{name}: positions reach {farthest:.0f} m; in millimetres? Set position_unit_m to 0.001 in the rig"
         )
     turns = numbers[:, list(columns.turns)]
     if columns.rotation:
-        poses[:, :3, :3] = rotations_of(name, turns, columns.rotation)
+        poses[:, :3, :3] = rotations_of(name, turns, columns.rotation, unit_rad)
         return poses
     approach = np.array([0.0, 0.0, 1.0]) if tool is None else np.asarray(tool)[:3, 2]
     orders = {"quat_xyzw": turns, "quat_wxyz": np.roll(turns, -1, axis=1)}
@@ -175,7 +225,7 @@ def poses_of(
     if len(sensible) != 1:
         ways = "both orders" if sensible else "neither order"
         raise DatasetError(
-            f"{name}: its quaternions have no order, and in {ways} the gripper points down; give rotation= in the Rig, "
+            f"{name}: its quaternions have no order, and in {ways} the gripper points down; give rotation in the rig, "
             "quat_xyzw or quat_wxyz"
         )
     poses[:, :3, :3] = matrices[sensible[0]]

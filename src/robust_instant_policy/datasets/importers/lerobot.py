@@ -15,19 +15,23 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from robust_instant_policy.datasets import layout
+from robust_instant_policy.datasets import coded_depth, layout
 from robust_instant_policy.datasets.folder import Folder, open_folder
 from robust_instant_policy.datasets.images import decode_image
 from robust_instant_policy.datasets.importers.depth import PIXEL_FORMAT, dequantised, is_depth, unit_of
 from robust_instant_policy.datasets.importers.hdf5 import choose_camera
+from robust_instant_policy.datasets.importers.joints import JointModel
 from robust_instant_policy.datasets.importers.layouts import (
+    ARMS,
     Columns,
     arm_of,
     axis_names,
     gripper_columns,
+    is_gripper,
     pose_columns,
     poses_of,
     unnamed_columns,
+    words_of,
 )
 from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode
 from robust_instant_policy.datasets.importers.timing import even_steps, held, resampled, seconds_of
@@ -38,8 +42,8 @@ from robust_instant_policy.geometry import FloatArray, as_numbers
 UNNAMED_POSES = {"cartesian_position": "rpy", "ee_pose": None, "eef_pose": None, "tcp_pose": None}  # and their rotation
 ADVICE = (
     "A LeRobot dataset names the axes of a pose ee.x, ee.y, ee.z and a rotation (ee.wx …, rx …, roll …, qx … qw), or "
-    "Rig(pose_key=, rotation=) says where it is, or Rig(joints=JointModel(urdf, link)) how to compute it; "
-    "Rig(depth_key=, depth_unit_m=) names the feature with the depth"
+    "the rig says where it is (pose_key, rotation) or how to compute it (joints: urdf, link), and which feature holds "
+    "the depth (depth_key, depth_unit_m)"
 )
 
 
@@ -57,11 +61,9 @@ def read_lerobot(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
     camera = choose_camera(path, cameras, rig.camera)
     depth_key = rig.depth_key or _depth_stream(features, camera)
     for episode in range(len(folder.episodes)):
-        poses, gripper = _poses(folder, episode, rig), _gripper(folder, episode)
+        poses, gripper = _poses(folder, episode, rig), _gripper(folder, episode, rig)
         rgb = None if camera is None else _first_image(folder, episode, camera)
         depth = None if depth_key is None else _first_depth(folder, episode, depth_key, rig.depth_unit_m)
-        if depth is not None and rgb is not None and depth.ndim == 1 and depth.size == rgb.shape[0] * rgb.shape[1]:
-            depth = depth.reshape(rgb.shape[:2])  # stored as one row of numbers
         name = f"{path} (episode {episode})"
         frames = np.arange(folder.episodes[episode]["length"])
         seconds = None if rig.rate_hz is not None else _seconds(folder, episode, name)
@@ -94,7 +96,12 @@ def _description(tasks: object) -> str:
 def _seconds(folder: Folder, episode: int, name: str) -> FloatArray | None:
     if "timestamp" not in folder.info["features"]:
         return None
-    return seconds_of(name, folder.matrix(episode, "timestamp")[:, 0], folder.rate_hz)
+    stamps = folder.matrix(episode, "timestamp")[:, 0]
+    if folder.info["features"]["timestamp"]["dtype"] == "float32" and len(stamps) > 1:
+        step = np.spacing(np.abs(stamps).max().astype(np.float32))
+        if step > 0.5 * np.ptp(stamps) / (len(stamps) - 1):  # as for times of day: too coarse for frames
+            return None
+    return seconds_of(name, stamps, folder.rate_hz)
 
 
 def _vectors(folder: Folder) -> list[str]:
@@ -108,10 +115,12 @@ def _poses(folder: Folder, episode: int, rig: Rig) -> FloatArray | None:
     """Poses ``(T, A, 4, 4)``; None where no feature is known to hold them."""
     where, name = [rig.pose_key] if rig.pose_key else _vectors(folder), f"{folder.root} (episode {episode})"
     if rig.joints is not None:
+        models = {"": rig.joints} if isinstance(rig.joints, JointModel) else dict(zip(ARMS, rig.joints, strict=True))
         for key in where:
             names = axis_names(folder.info["features"][key])
             if names:
-                return rig.joints.poses(names, _matrix(folder, episode, key, names))[:, None]
+                values = _matrix(folder, episode, key, names)
+                return np.stack([model.poses(names, values, arm) for arm, model in models.items()], axis=1)
     arms: dict[str, FloatArray] = {}
     for key in where:
         names = axis_names(folder.info["features"][key])
@@ -119,39 +128,43 @@ def _poses(folder: Folder, episode: int, rig: Rig) -> FloatArray | None:
             arm = columns.arm or arm_of(key)
             if arm not in arms:
                 values = _matrix(folder, episode, key, names)
-                arms[arm] = poses_of(name, values, columns, rig.position_unit_m, rig.tool)
+                arms[arm] = poses_of(name, values, columns, rig.position_unit_m, rig.rotation_unit_rad, rig.tool)
         if {"left", "right"} <= arms.keys() or "" in arms:
             break
-    chosen = [arms[arm] for arm in ("left", "right") if arm in arms] or list(arms.values())
+    chosen = [arms[arm] for arm in ARMS if arm in arms] or list(arms.values())
     return np.stack(chosen, axis=1) if chosen else None
 
 
 def _unnamed(folder: Folder, key: str, names: list[str], rig: Rig) -> list[Columns]:
     """The pose in a feature that does not name its columns."""
-    last = key.replace("left_", "").replace("right_", "").rsplit(".", 1)[-1]
-    if key != rig.pose_key and last not in UNNAMED_POSES:
+    told = "_".join(word for word in words_of(key) if word not in ARMS)
+    usual = next((name for name in UNNAMED_POSES if told.endswith(name)), None)
+    if key != rig.pose_key and usual is None:
         return []
     size = int(np.prod(folder.info["features"][key]["shape"]))
     if len({*map(str.lower, names)} & {"x", "y", "z"}) == 3:  # named, in a way that is not understood
         return []
-    columns = unnamed_columns(size, rig.rotation or UNNAMED_POSES.get(last))
+    columns = unnamed_columns(size, rig.rotation or UNNAMED_POSES.get(usual or ""))
     return [] if columns is None else [columns]
 
 
-def _gripper(folder: Folder, episode: int) -> FloatArray | None:
+def _gripper(folder: Folder, episode: int, rig: Rig) -> FloatArray | None:
     """Values of the grippers ``(T, A)``; None where no feature holds them."""
     found: dict[str, FloatArray] = {}
     for key in _vectors(folder):
-        names = axis_names(folder.info["features"][key])
+        names, (size, *more) = axis_names(folder.info["features"][key]), folder.info["features"][key]["shape"] or [1]
         columns = gripper_columns(names)
-        if not columns and "gripper" in key and folder.info["features"][key]["shape"] == [1]:
+        if not columns and is_gripper(key) and size == 1 and not more:
             columns, names = {arm_of(key): 0}, []
+        for pose in () if columns else _unnamed(folder, key, names, rig):
+            if size == len(pose.position) + len(pose.turns) + 1:  # one number more than those of the pose
+                columns = {arm_of(key): size - 1}
         for arm, column in columns.items():
             if arm not in found:
                 found[arm] = _matrix(folder, episode, key, names)[:, column]
         if {"left", "right"} <= found.keys() or "" in found:
             break
-    chosen = [found[arm] for arm in ("left", "right") if arm in found] or list(found.values())
+    chosen = [found[arm] for arm in ARMS if arm in found] or list(found.values())
     return np.stack(chosen, axis=1) if chosen else None
 
 
@@ -176,18 +189,24 @@ def _depth_stream(features: Mapping[str, Any], camera: str | None) -> str | None
 def _first_depth(folder: Folder, episode: int, key: str, unit_m: float | None) -> NDArray[np.float32]:
     """Depth ``(H, W)``, or ``(H·W,)`` where it is stored so, metres, of the first frame."""
     feature = folder.info["features"][key]
-    if key in folder.video_keys:
-        if not is_depth(feature):
-            raise DatasetError(
-                f"{folder.root}: {key} is a colour video, which holds no depth; record depth as a depth stream of "
-                "lerobot 0.6, or as a feature with one number a pixel"
-            )
+    if key in folder.video_keys and is_depth(feature):
         codes = next(folder.frames(episode, key, PIXEL_FORMAT))
         return dequantised(codes, feature, f"{folder.root}: {key}")
+    image = _first_image(folder, episode, key)
+    if image.ndim == 3 and image.shape[2] == 3:
+        coded = coded_depth.decode(image)
+        if coded is None:
+            raise DatasetError(
+                f"{folder.root}: {key} is a colour image, which holds no depth; record depth as a depth stream of "
+                "lerobot 0.6, as a feature with one number a pixel, or coded as rip_twin does with --robot.depth=coded"
+            )
+        return coded
     unit = unit_m or unit_of(feature)
     if unit is None:
-        raise DatasetError(f"{folder.root} does not say the unit of {key!r}; give depth_unit_m=, metres a step")
-    depth = _first_image(folder, episode, key).astype(np.float32) * np.float32(unit)
+        raise DatasetError(
+            f"{folder.root} does not say the unit of {key!r}; give depth_unit_m, metres per step, in the rig"
+        )
+    depth = image.astype(np.float32) * np.float32(unit)
     return depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
 
 

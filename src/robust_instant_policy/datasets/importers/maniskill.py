@@ -65,13 +65,13 @@ def _read_episode(
     path: Path, name: str, group: Any, camera: str | None, episode: Mapping[str, Any], kwargs: Mapping[str, Any]
 ) -> SourceEpisode:
     chosen = choose_camera(path, members(group, "obs/sensor_data"), camera)
-    images, depth = (read(group, f"obs/sensor_data/{chosen}/{kind}", ndim=4) for kind in ("rgb", "depth"))
-    intrinsics = first_matrix(read(group, f"obs/sensor_param/{chosen}/intrinsic_cv", ndim=3))
-    extrinsics = first_matrix(read(group, f"obs/sensor_param/{chosen}/extrinsic_cv", ndim=3))
+    images, depth = (read(group, f"obs/sensor_data/{chosen}/{kind}", 4) for kind in ("rgb", "depth"))
+    intrinsics = first_matrix(read(group, f"obs/sensor_param/{chosen}/intrinsic_cv", 3))
+    extrinsics = first_matrix(read(group, f"obs/sensor_param/{chosen}/extrinsic_cv", 3))
     if extrinsics is not None and extrinsics.shape != (3, 4):
         raise DatasetError(f"{path} ({name}): extrinsic_cv must be (T, 3, 4), got matrices of {extrinsics.shape}")
-    tcp = read(group, "obs/extra/tcp_pose", ndim=2)
-    actions = read(group, "actions", ndim=2)
+    tcp = read(group, "obs/extra/tcp_pose", 2)
+    actions = read(group, "actions", 2)
     panda = _robots(group, kwargs) & set(PANDAS)
     return SourceEpisode(
         name=f"{path.name} ({name})",

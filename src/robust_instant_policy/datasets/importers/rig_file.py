@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,7 @@ from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.files import excerpt, read_json
 from robust_instant_policy.geometry import GripperTriangle, as_numbers
 
-OBJECTS = {"triangle": GripperTriangle, "gripper": GripperCommand, "joints": JointModel}
-MATRICES = {"intrinsics": (3, 3), "camera_pose": (4, 4), "tool": (4, 4)}
-TEXTS = ("camera", "depth_key", "pose_key", "rotation")
+OBJECTS = {kind.__name__: kind for kind in (Rig, GripperTriangle, GripperCommand, JointModel)}
 
 
 def read_rig(path: Path) -> Rig:
@@ -24,32 +22,40 @@ def read_rig(path: Path) -> Rig:
     Raises `DatasetError` in one line for what is missing, unknown or wrong.
     """
     content = read_json(path, "a description of a rig")
-    known = [field.name for field in fields(Rig)]
-    unknown = [key for key in content if key not in known]
-    if unknown or "triangle" not in content:
-        what = (
-            f"has no {excerpt(unknown[0])!r}" if unknown else 'needs "triangle": {"length": metres, "opening": metres}'
-        )
-        raise DatasetError(f"{path}: a rig {what}; its keys are {', '.join(known)}")
     try:
-        return Rig(**{key: _value(key, value, path.parent) for key, value in content.items()})
-    except (InvalidValueError, TypeError, ValueError) as error:
+        return _value("a rig", "Rig", content, path.parent)
+    except InvalidValueError as error:
         raise DatasetError(f"{path} is not a description of a rig: {excerpt(error)}") from None
 
 
-def _value(key: str, value: Any, folder: Path) -> Any:
-    if key in OBJECTS:
-        if not isinstance(value, Mapping):
-            raise ValueError(f"{key} must be an object")
-        given = {name: tuple(inner) if isinstance(inner, list) else inner for name, inner in value.items()}
-        if key == "joints":
-            given["urdf"] = folder / str(given.get("urdf"))
-        return OBJECTS[key](**given)
-    if key in MATRICES:
-        matrix = as_numbers(key, value)
-        if matrix.shape != MATRICES[key]:
-            raise ValueError(f"{key} must be {MATRICES[key]}, got {matrix.shape}")
-        return matrix
-    if not isinstance(value, str if key in TEXTS else int | float) or isinstance(value, bool):
-        raise ValueError(f"{key} must be {'text' if key in TEXTS else 'a number'}, got {excerpt(repr(value))}")
-    return value
+def _value(key: str, kind: str, value: Any, folder: Path) -> Any:
+    """``value`` as the type that the annotation ``kind`` of the field ``key`` names. Raises `InvalidValueError`."""
+    kind, *others = kind.removesuffix(" | None").split(" | ")
+    if others and isinstance(value, list):  # of objects
+        return tuple(_value(key, kind, inner, folder) for inner in value)
+    if kind in OBJECTS:
+        return _object(key, OBJECTS[kind], value, folder)
+    if kind == "FloatArray":
+        return as_numbers(key, value)
+    if kind == "tuple[str, ...]":
+        if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
+            raise InvalidValueError(f"{key} must be a list of text, got {excerpt(repr(value))}")
+        return tuple(value)
+    if kind == "float" and isinstance(value, int | float) and not isinstance(value, bool):
+        return value
+    if kind == "float" or not isinstance(value, str):
+        wanted = "a number" if kind == "float" else "text"
+        raise InvalidValueError(f"{key} must be {wanted}, got {excerpt(repr(value))}")
+    return folder / value if kind == "Path" else value
+
+
+def _object(key: str, kind: type, value: Any, folder: Path) -> Any:
+    if not isinstance(value, Mapping):
+        raise InvalidValueError(f"{key} must be an object, got {excerpt(repr(value))}")
+    known = {field.name: field for field in fields(kind)}
+    unknown = [name for name in value if name not in known]
+    lacking = [name for name, field in known.items() if field.default is MISSING and name not in value]
+    if unknown or lacking:
+        what = f"has no {excerpt(repr(unknown[0]))}" if unknown else f"needs {', '.join(lacking)}"
+        raise InvalidValueError(f"{key} {what}; its keys are {', '.join(known)}")
+    return kind(**{name: _value(name, str(known[name].type), inner, folder) for name, inner in value.items()})

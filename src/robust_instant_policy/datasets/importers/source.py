@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from robust_instant_policy.checks import checked_array, checked_pose, checked_positive
 from robust_instant_policy.datasets.importers.joints import JointModel
 from robust_instant_policy.datasets.importers.layouts import ROTATIONS
 from robust_instant_policy.demonstration import Demonstration, Observation
@@ -44,8 +45,10 @@ class Rig:
 
     For LeRobot datasets, ``depth_key`` is the feature with the depth and ``depth_unit_m`` the metres per step, where
     the dataset does not say it; ``pose_key`` the one with the poses, ``rotation`` one of `layouts.ROTATIONS`, where
-    names leave it open, and ``position_unit_m`` the metres per step of positions; ``joints`` makes poses of joints.
-    Raises `InvalidValueError` for an unknown ``rotation``.
+    names leave it open; ``position_unit_m`` and ``rotation_unit_rad`` the metres and radians per step of positions and
+    angles; ``joints`` makes poses of joints, with one model for each arm, the left one first.
+    Raises `InvalidValueError` for an unknown ``rotation``, a ``tool`` or ``camera_pose`` that is not rigid, and a rate
+    or unit that is not positive.
     """
 
     triangle: GripperTriangle
@@ -60,11 +63,22 @@ class Rig:
     pose_key: str | None = None
     rotation: str | None = None
     position_unit_m: float = 1.0
-    joints: JointModel | None = None
+    rotation_unit_rad: float = 1.0
+    joints: JointModel | tuple[JointModel, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.rotation is not None and self.rotation not in ROTATIONS:
             raise InvalidValueError(f"rotation must be one of {', '.join(ROTATIONS)}, got {self.rotation!r}")
+        if isinstance(self.joints, tuple) and len(self.joints) != 2:
+            raise InvalidValueError(f"joints must be one model, or two for two arms, got {len(self.joints)}")
+        if self.intrinsics is not None:
+            checked_array("intrinsics", self.intrinsics, "(3, 3)")
+        for name in ("camera_pose", "tool"):
+            if getattr(self, name) is not None:
+                checked_pose(name, getattr(self, name))
+        for name in ("rate_hz", "depth_unit_m", "position_unit_m", "rotation_unit_rad"):
+            if getattr(self, name) is not None:
+                checked_positive(name, getattr(self, name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +127,10 @@ class SourceEpisode:
         ):
             raise DatasetError(f"{self.name} lacks {'; '.join(self._missing())}{self.advice and '. ' + self.advice}")
         if self.poses.shape[:-2] != self.gripper_values.shape:
+            poses, grippers = self.poses.shape[:-2], self.gripper_values.shape
             raise DatasetError(
-                f"{self.name} is damaged: it has poses {self.poses.shape[:-2]} and gripper values "
-                f"{self.gripper_values.shape} of steps and arms"
+                f"{self.name} has poses of {poses[0]} steps and {(*poses, 1)[1]} arms, but gripper values of "
+                f"{grippers[0]} steps and {(*grippers, 1)[1]} arms"
             )
         if not np.isfinite(self.gripper_values).all():
             raise DatasetError(f"{self.name} is damaged: its gripper values are not all finite")
@@ -123,7 +138,10 @@ class SourceEpisode:
             trajectory = Trajectory.from_poses(
                 self.poses @ self.tool, self.gripper.state(self.gripper_values), triangle
             )
-            observation = Observation(self.rgb, self.depth, self.intrinsics, self.camera_pose)
+            depth = self.depth
+            if depth.ndim < 3 and depth.size == self.rgb.shape[0] * self.rgb.shape[1]:
+                depth = depth.reshape(self.rgb.shape[:2])  # it may be stored as one row of numbers
+            observation = Observation(self.rgb, depth, self.intrinsics, self.camera_pose)
             return Demonstration(observation, trajectory, self.rate_hz, task, info=self.info)
         except InvalidValueError as error:
             raise DatasetError(f"{self.name}: {error}") from error
@@ -136,11 +154,11 @@ class SourceEpisode:
             "gripper_values": "the gripper's commands or positions",
             "rgb": "a colour image of the start",
             "depth": "a depth image of the start",
-            "intrinsics": "the camera's intrinsics (known? Rig(intrinsics=), 3 x 3)",
-            "camera_pose": "the camera's pose in the world (known? Rig(camera_pose=), 4 x 4, OpenCV axes)",
-            "tool": "the tool frame within the end effector's (known? Rig(tool=), 4 x 4: z out of the gripper, "
+            "intrinsics": "the camera's intrinsics (in the rig: intrinsics, 3 x 3)",
+            "camera_pose": "the camera's pose in the world (in the rig: camera_pose, 4 x 4, OpenCV axes)",
+            "tool": "the tool frame within the end effector's (in the rig: tool, 4 x 4: z out of the gripper, "
             "y along the line on which the fingers open, origin between the fingertips)",
-            "gripper": f"the meaning of its gripper values{span} (known? Rig(gripper=GripperCommand(open=, closed=)))",
-            "rate_hz": "the recording rate (known? Rig(rate_hz=))",
+            "gripper": f"the meaning of its gripper values{span} (in the rig: gripper, with open and closed)",
+            "rate_hz": "the recording rate (in the rig: rate_hz)",
         }
         return [description for name, description in needs.items() if getattr(self, name) is None]

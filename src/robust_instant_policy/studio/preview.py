@@ -1,0 +1,89 @@
+"""A translucent ghost of the arms that goes along a plan."""
+
+from __future__ import annotations
+
+import threading
+import time
+from functools import partial
+from typing import Any
+
+import numpy as np
+import viser
+
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.waypoints import plan_waypoints
+from robust_instant_policy.studio.cell import Cell
+from robust_instant_policy.studio.stage import place
+from robust_instant_policy.trajectory import Trajectory
+
+SECONDS, RATE_HZ = 5.0, 25.0
+COLOUR, OPACITY = (46, 134, 171), 0.35
+
+
+class Preview:
+    """Shows one ghost at a time in ``scene``, in a thread of its own."""
+
+    def __init__(self, scene: viser.SceneApi):
+        self._scene = scene
+        self._stopped = threading.Event()
+
+    def stop(self) -> None:
+        self._stopped.set()
+
+    def start(self, trajectory: Trajectory, cell: Cell | None) -> None:
+        """Let a ghost of the arms of ``cell``, or of the gripper's three points where there are none, go along
+        ``trajectory``. Raises `UnreachableError`."""
+        self.stop()
+        self._stopped = stopped = threading.Event()
+        if cell is None or not cell.arms:
+            sweep = partial(self._sweep_triangle, trajectory, stopped)
+        else:  # poses are computed here: the kinematics belong to the session's thread
+            joints = plan_waypoints(trajectory, cell.arms, cell.execute_hz, cell.control_hz).joints
+            shown = joints[np.linspace(0, len(joints) - 1, round(SECONDS * RATE_HZ)).astype(int)]
+            poses = [
+                {
+                    name: pose
+                    for arm, own in zip(cell.arms, step, strict=True)
+                    for name, pose in arm.kinematics.body_poses(own).items()
+                }
+                for step in shown
+            ]
+            sweep = partial(self._sweep, self._ghost(cell, poses[0]), poses, stopped)
+        threading.Thread(target=sweep, name="preview", daemon=True).start()
+
+    def _sweep_triangle(self, trajectory: Trajectory, stopped: threading.Event) -> None:
+        node = self._scene.add_line_segments(
+            "/ghost/triangle", np.zeros((1, 2, 3)), COLOUR, thickness=6.0, thickness_units="screen"
+        )
+        for at in np.linspace(0, 1, round(SECONDS * RATE_HZ)):
+            if stopped.is_set():
+                break
+            points = trajectory.resampled([at]).triplets[0]
+            node.points = np.concatenate([points[:, [0, 1]], points[:, [0, 2]]]).astype(np.float32)
+            time.sleep(1 / RATE_HZ)
+        node.remove()
+
+    def _sweep(self, ghost: dict[str, Any], path: list[dict[str, FloatArray]], stopped: threading.Event) -> None:
+        for poses in path:
+            if stopped.is_set():
+                break
+            for name, node in ghost.items():
+                place(node, poses[name])
+            time.sleep(1 / RATE_HZ)
+        for node in ghost.values():
+            node.remove()
+
+    def _ghost(self, cell: Cell, poses: dict[str, FloatArray]) -> dict[str, Any]:
+        ghost = {}
+        for name in poses:
+            parts = [surface for surface in cell.surfaces() if surface.body == name]
+            if parts:
+                starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+                ghost[name] = self._scene.add_mesh_simple(
+                    f"/ghost/{name.replace('/', '.')}",
+                    np.concatenate([part.vertices for part in parts]),
+                    np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]),
+                    color=COLOUR,
+                    opacity=OPACITY,
+                )
+        return ghost
