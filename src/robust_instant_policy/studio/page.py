@@ -136,6 +136,7 @@ class Page:
                 place(gizmo, targets[index])
                 self._targets[index] = targets[index]
         self._tell(*self._situation(status))
+        self._server.flush()  # do not wait for more messages
 
     def on_kept(self, demonstration: Demonstration, folder: Path, count: int) -> None:
         self.demonstrations.append(demonstration)
