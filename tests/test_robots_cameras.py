@@ -228,6 +228,19 @@ def test_a_lerobot_camera_is_read_in_metres_and_only_with_aligned_depth():
         LeRobotCamera("top", Shape(), INTRINSICS, aligned=False).connect()
 
 
+def test_a_lerobot_camera_that_repeats_its_image_is_frozen():
+    device = Shape()
+    camera = LeRobotCamera("top", device, INTRINSICS, aligned=True)
+    camera.connect()
+    rng = np.random.default_rng(0)
+    device.read = lambda: rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    for _ in range(2):
+        last = camera.read().rgb
+    device.read = lambda: last
+    with pytest.raises(RobotError, match="top repeats the same image: it is frozen"):
+        camera.read()
+
+
 def test_a_folder_is_replayed_in_order_and_ends(tmp_path):
     rgb, depth = grey()
     for index in (1, 0):

@@ -68,6 +68,14 @@ class Desk:
     def disconnect(self) -> None: ...
 
 
+TWO = """[[arms]]
+name = "left"
+model = "viperx-300"
+park = [-1.4, -0.43, 0.434, 0, 1.567, 0]
+driver = { kind = "viperx", port = "/dev/null" }
+[[arms]]"""
+
+
 @pytest.fixture
 def cell(tmp_path, monkeypatch):
     module = SimpleNamespace(desk=Desk())
@@ -106,6 +114,42 @@ def test_a_plan_arrives_in_the_robots_own_units_and_its_torque_stays_on(cell):
     assert desk.values["gripper.pos"] == pytest.approx(0.0)
 
 
+def test_a_joint_that_turns_without_end_has_no_range(cell):
+    path, desk = cell
+    urdf = path.parent / "desk.urdf"
+    before, roll = urdf.read_text().split('<joint name="wrist_roll" type="revolute">')
+    roll = roll.replace('<limit lower="-2" upper="2" velocity="3" effort="3"/>', "", 1)
+    urdf.write_text(f'{before}<joint name="wrist_roll" type="continuous">{roll}')
+    path.write_text(path.read_text().replace("0.9, 0.0]", "0.9, 3.5]"))
+    desk.values["wrist_roll.pos"] = np.rad2deg(3.5)
+    with Station(CellConfig.load(path)) as station:
+        assert not station.play(turn(station), StopRequest()).stopped
+
+
+def test_an_arm_that_cannot_be_stopped_leaves_the_others_stopped_and_all_disconnected(cell, monkeypatch):
+    path, desk = cell
+    station = Station(CellConfig.load(path))
+    (first,), done = station.followers, []
+
+    class Second:
+        def connect(self): ...
+        def stop(self):
+            done.append("stopped")
+
+        def disconnect(self):
+            done.append("disconnected")
+
+    def broken():
+        raise KeyError("no such register")
+
+    monkeypatch.setattr(first, "stop", broken)
+    desk.disconnect = lambda: done.append("desk disconnected")
+    station.followers = first, Second()
+    with pytest.raises(KeyError), station:
+        pass
+    assert done == ["stopped", "disconnected", "desk disconnected"]
+
+
 def test_a_robot_that_does_not_answer_stops_the_run_and_is_named(cell):
     path, desk = cell
     with Station(CellConfig.load(path)) as station:
@@ -121,10 +165,14 @@ def test_a_robot_that_does_not_answer_stops_the_run_and_is_named(cell):
         ("wrist_roll.pos", "", "keys must name 5 joints"),
         ("'my_robot:make'", "'my_robot:nothing'", "factory must be module:function"),
         ("'desk.urdf'", "'other.urdf'", "no model 'other.urdf'; known: viperx-300"),
+        ("'desk.urdf'", "'broken.urdf'", "^[^\\n]*broken.urdf cannot be used: [^\\n]*; it needs a link called tool$"),
+        ("signs = [1,", "signs = [0.5,", "signs must be 1 or -1 for each joint"),
+        ("[[arms]]", TWO, "arms of a cell must have as many joints as each other, not left 6, desk 5"),
     ],
 )
 def test_a_wrong_line_about_the_robot_is_named(cell, old, new, words):
     path, _ = cell
-    path.write_text(path.read_text().replace(old, new))
+    (path.parent / "broken.urdf").write_text("<robot><joint/></robot>")
+    path.write_text(path.read_text().replace(old, new, 1))
     with pytest.raises(CellError, match=words):
         Station(CellConfig.load(path))

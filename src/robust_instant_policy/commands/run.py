@@ -12,7 +12,7 @@ from robust_instant_policy.commands.options import RUNS, add_method, method_sett
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import StoppedError, UsageError
-from robust_instant_policy.files import write_whole
+from robust_instant_policy.files import make_folder, write_whole
 from robust_instant_policy.llm import connect
 from robust_instant_policy.motion.arm import Motion
 from robust_instant_policy.motion.guard import plan_guarded
@@ -29,14 +29,23 @@ from robust_instant_policy.reporting.run import (
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.client import Emulation, devices_of
-from robust_instant_policy.robots.execution import is_parked, observe, park, require_trust
+from robust_instant_policy.robots.execution import (
+    has_open_grippers,
+    is_parked,
+    observe,
+    open_grippers,
+    park,
+    require_trust,
+)
 from robust_instant_policy.robots.signals import stop_on_signals
-from robust_instant_policy.robots.station import Played, Station
+from robust_instant_policy.robots.station import HOLDING, Played, Station
+
+PLANNED, UNJUDGED = "planned, not executed", "executed, not judged"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", type=Path, required=True, metavar="FILE", help="file of the cell")
-    parser.add_argument("--demos", required=True, metavar="DIR", help="folder of demonstrations of this cell")
+    parser.add_argument("--demos", metavar="DIR", help="folder of demonstrations of this cell")
     parser.add_argument(
         "--plan", type=Path, metavar="DIR", help="execute the plan of an earlier --dry-run in this folder"
     )
@@ -57,8 +66,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     screen = StageConsole()
     config = CellConfig.load(options.robot)
+    if options.plan is None and options.demos is None:
+        raise UsageError("--demos DIR is missing: the demonstrations to plan from (or --plan DIR, a plan to execute)")
+    if options.plan is not None and not (options.plan / PLAN_FILE).exists():
+        raise UsageError(f"{options.plan} holds no plan; make one with: rip run --dry-run --out {options.plan}")
     out = options.plan or options.out or RUNS / config.name
-    out.mkdir(parents=True, exist_ok=True)
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file; a run needs a folder")
+    make_folder(out)
     with devices_of(config) as (config, emulation):
         _Run(config, emulation, out, options, screen).run()
     return 0
@@ -87,17 +102,18 @@ class _Run:
         with station:
             self._park(station)
             motion, record = self._prepare(station)
+            self._open_grippers(station)
             seconds = len(motion.joints) / station.rate_hz
             self._confirm(f"execute {seconds:.0f} s of motion at {100 * self._speed:.0f}% of the usual speed?")
             with self._screen.stage("execution"), stop_on_signals() as stop:
                 played = station.play(motion, stop)
             played.path.save(self._out / MEASURED_FILE)
+            replace(record, outcome=UNJUDGED).save(self._out)  # a person may take long to judge
             success, outcome = self._judge(played)
             grasps = played.path.empty_grasps([arm.name for arm in station.arms])
             self._report(record, success, "; ".join([outcome, *grasps]))
-            if played.stopped:
-                raise StoppedError(f"{played.stopped}; the arms hold their position")
-        if success is not False:
+            played.require_end()
+        if success:  # not where nobody judged it
             write_whole(self._done, b"")
 
     def _park(self, station: Station) -> None:
@@ -106,12 +122,24 @@ class _Run:
         self._confirm("the arms are not at their park pose; move them there slowly?")
         with self._screen.stage("park"), stop_on_signals() as stop:
             played = park(station, stop, min(self._speed, self._config.first_run_speed))
-        if played.stopped:
-            raise StoppedError(f"{played.stopped}; the arms hold their position")
+        played.require_end()
+
+    def _open_grippers(self, station: Station) -> None:
+        """A plan begins with open grippers; the person takes what is still held."""
+        if has_open_grippers(station):
+            return
+        self._confirm("a gripper is closed: hold what it has; open it?")
+        with self._screen.stage("open grippers"), stop_on_signals() as stop:
+            open_grippers(station, stop)
+        if stop.reason:
+            raise StoppedError(f"{stop.reason}; {HOLDING}")
 
     def _prepare(self, station: Station) -> tuple[Motion, RunRecord]:
         """A checked motion, and what is known of the run; the page shows the plan already."""
         record = RunRecord.load(self._out) if self._options.plan else self._plan()
+        record = replace(record, success=None, outcome=PLANNED)
+        record.save(self._out)
+        (self._out / MEASURED_FILE).unlink(missing_ok=True)  # of an earlier run
         plan = Plan.load(self._out / PLAN_FILE)
         page = write_report(self._out)
         self._screen.say(f"the plan, with a confidence of {plan.confidence or 0.0:.2f}: {page}")
@@ -152,15 +180,10 @@ class _Run:
         seen.save(self._out / SEEN_FILE)
         plan.save(self._out / PLAN_FILE)
         save_context(self._out, [one.observation.rgb for one in demonstrations], policy.context_.pixels)
-        (self._out / MEASURED_FILE).unlink(missing_ok=True)  # of an earlier run
         for note in plan.notes:
             self._screen.say(f"    {note}")
         task = demonstrations[0].task or self._config.name
-        record = RunRecord(
-            task, task, None, model.name, policy.name, None, "planned, not executed", tuple(self._screen.stages)
-        )
-        record.save(self._out)
-        return record
+        return RunRecord(task, task, None, model.name, policy.name, None, PLANNED, tuple(self._screen.stages))
 
     def _observation(self) -> Observation:
         if self._config.camera is None:
@@ -181,8 +204,11 @@ class _Run:
             failure = self._emulation.failure()
             return not failure, f"failed: {failure}" if failure else "success"
         if self._options.yes:
-            return None, "executed, not judged"
-        success = _agrees("did it succeed?")
+            return None, UNJUDGED
+        try:
+            success = _agrees("did it succeed?")
+        except (StoppedError, KeyboardInterrupt):
+            return None, UNJUDGED
         return success, "success" if success else "failed: judged so"
 
     def _report(self, record: RunRecord, success: bool | None, outcome: str) -> None:
@@ -199,7 +225,10 @@ class _Run:
 def _agrees(question: str) -> bool:
     if not sys.stdin.isatty():
         raise UsageError("there is no terminal to ask on; use --yes to execute without asking")
-    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+    try:
+        return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        raise StoppedError("the terminal was closed; the arms hold") from None
 
 
 def _share(text: str) -> float:

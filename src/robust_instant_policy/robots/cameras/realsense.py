@@ -20,7 +20,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from robust_instant_policy.errors import MissingExtraError, RobotError
 from robust_instant_policy.robots.calibration.board import opencv
-from robust_instant_policy.robots.camera import Frame
+from robust_instant_policy.robots.camera import Frame, check_alive
 
 WARM_UP_FRAMES = 30  # until exposure and white balance are stable: 1 s
 BURST = 6  # frames that the temporal filter combines
@@ -51,7 +51,7 @@ class RealSenseCamera:
         self._width, self._height, self._rate_hz, self._burst = width, height, rate_hz, burst
         self._sensors: list[Any] = []
         self._last = (-1, -1)  # numbers of the last depth and colour frame
-        self._last_pixels: NDArray[np.uint8] | None = None
+        self._before: NDArray[np.uint8] | None = None
 
     def connect(self) -> None:
         rs = sdk()
@@ -94,7 +94,8 @@ class RealSenseCamera:
         depth, color = aligned.get_depth_frame(), aligned.get_color_frame()
         rgb = np.array(color.get_data())
         metres = np.asarray(depth.get_data()) * np.float32(depth.get_units())
-        self._check_alive(rgb)
+        check_alive(self.name, rgb, self._before)
+        self._before = rgb
         if self._maps is not None:
             cv2, (columns, rows) = opencv(), self._maps
             rgb = cv2.remap(rgb, columns, rows, cv2.INTER_LINEAR)
@@ -154,13 +155,6 @@ class RealSenseCamera:
             f"{self.name} has sent no new pair of colour and depth for {TIMEOUT_S:g} s: check the cable and the USB 3 "
             "port, then connect again"
         )
-
-    def _check_alive(self, rgb: NDArray[np.uint8]) -> None:
-        """Raises `RobotError` for an image that repeats the last one: noise makes any two images differ."""
-        frozen = self._last_pixels is not None and np.array_equal(self._last_pixels, rgb) and rgb.std() > 0
-        self._last_pixels = rgb
-        if frozen:
-            raise RobotError(f"{self.name} repeats the same image: it is frozen; unplug it and connect it again")
 
 
 def sdk() -> Any:
