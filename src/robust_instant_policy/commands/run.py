@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
         planner = None if options.plan else stack.enter_context(_Planner.open(config, options, screen))
         _Run(config, emulation, planner, out, options, screen).run()
         for number in count(2):
-            if options.plan or options.dry_run or options.yes or not _agrees("arrange the next scene; go on?"):
+            if options.plan or options.dry_run or options.yes or not _goes_on():
                 break
             if emulation is not None:
                 emulation.scene(number - 1 + config.emulation_section().whole("seed", 0))
@@ -260,6 +260,13 @@ def _agrees(question: str) -> bool:
         return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
     except EOFError:
         raise StoppedError("the terminal was closed; the arms hold") from None
+
+
+def _goes_on() -> bool:
+    try:
+        return _agrees("arrange the next scene; go on?")
+    except StoppedError:  # the terminal was closed
+        return False
 
 
 def _share(text: str) -> float:
