@@ -154,8 +154,8 @@ class RealSenseCamera:
             self._last = numbers
             return frames
         raise RobotError(
-            f"{self.name} has sent no new pair of colour and depth for {self._timeout_s:g} s: check the cable and the USB 3 "
-            "port, then connect again"
+            f"{self.name} has sent no new pair of colour and depth for {self._timeout_s:g} s: check the cable and the "
+            "USB 3 port, then connect again"
         )
 
 
