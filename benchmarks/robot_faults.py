@@ -32,7 +32,7 @@ import numpy as np
 from robust_instant_policy.errors import RipError
 from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.motion.arm import Arm, Motion
-from robust_instant_policy.motion.guard import Space, check_joint_range, plan_guarded
+from robust_instant_policy.motion.guard import ROUNDING_M, Space, check_joint_range, plan_guarded
 from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cell import CellConfig, DeviceConfig
 from robust_instant_policy.robots.emulation.client import Emulation, emulated
@@ -360,7 +360,9 @@ def outside_limits(executed: FloatArray, arm: Arm, config: CellConfig) -> str:
         if not np.isfinite(executed).all():
             return "not a number"
         check_joint_range(joints[:, 0], arm, config.rate_hz)
-        Space([arm], config.limits).check(joints, config.rate_hz)
+        space = Space([arm], config.limits)
+        on_its_way_in = (space.outside(joints) > ROUNDING_M).all()  # from the park pose, when it was stopped
+        space.check(joints, config.rate_hz, to_home=on_its_way_in)
     except RipError as error:
         return str(error)
     steps = np.abs(np.diff(joints[:, 0], axis=0)).max(axis=1)
