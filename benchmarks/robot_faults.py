@@ -96,12 +96,12 @@ class Bench:
         if self._emulation is None:
             self._context = emulated(self._config)
             self._emulation = self._context.__enter__()
-            if self._real_time:
-                self._emulation = replace(self._emulation, config=in_real_time(self._emulation.config))
         self._emulation.fault(self.name, "")
         with Station(self._emulation.config) as station:
             if not is_parked(station) and (stopped := park(station, StopRequest(), 1.0).stopped):
                 raise SystemExit(f"the emulated arm could not be parked for the next case: {stopped}; run again")
+        if self._real_time:
+            return replace(self._emulation, config=in_real_time(self._emulation.config))
         return self._emulation
 
     def close(self) -> None:
@@ -163,6 +163,8 @@ def during_motion(fault: str) -> Callable[[Case], Outcome]:
             motion = case.motion(station)
             with _at(emulation, begun + case.moment(motion), fail):
                 played = station.play(motion, StopRequest())
+        if math.isinf(since[0]):
+            raise SystemExit(f"stopped before the fault, this computer is too busy: {played.stopped}; run again")
         return replace(_judged(case, emulation, begun, played), late=max(emulation.times()[-1] - since[0], 0.0))
 
     return inject
