@@ -1,15 +1,18 @@
 """Faults injected into emulated cells while arms move: does a command leave the limits, does an arm move on or let go?
 
     python benchmarks/robot_faults.py [--quick] [--out docs/tables/robot_faults.md] [--rows runs/robot-faults.jsonl]
+    python benchmarks/robot_faults.py --watchdog --out docs/tables/robot_watchdog.md --rows runs/robot-watchdog.jsonl
 
 The drivers are the real ones; the emulated devices keep what they executed, and that is what is judged. Each case has
-its own motion and moment of the fault, from its seed. An interrupted run continues.
+its own motion and moment of the fault, from its seed. An interrupted run continues. ``--watchdog`` injects the faults
+of devices at the rate and with the timeouts of real ones, and measures how long the arm goes on.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import multiprocessing
 import os
 import resource
@@ -21,6 +24,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from unittest import mock
 
 import numpy as np
@@ -28,9 +32,9 @@ import numpy as np
 from robust_instant_policy.errors import RipError
 from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.motion.arm import Arm, Motion
-from robust_instant_policy.motion.guard import Space, check_joint_range, plan_guarded
+from robust_instant_policy.motion.guard import ROUNDING_M, Space, check_joint_range, plan_guarded
 from robust_instant_policy.robots.camera import Frame
-from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.cell import CellConfig, DeviceConfig
 from robust_instant_policy.robots.emulation.client import Emulation, emulated
 from robust_instant_policy.robots.execution import is_parked, observe, park, require_trust
 from robust_instant_policy.robots.path import MeasuredPath
@@ -42,6 +46,9 @@ CELLS = {
     "viperx": ("left", "viperx-300", (-0.469, 0, 0, 0, 0, 0), (-1.4, -0.43, 0.434, 0, 1.567, 0), (-0.15, 0.0), 10.0),
     "ur5e": ("hand-e", "ur5e-hand-e", (-0.5, 0, 0, 0, 0, 0), (0.9, -1.9, 2.2, -1.87, -1.5708, -0.67), (0.0, 0.0), 4.0),
 }  # name, model, base, park, middle of the targets in x and y, pace
+ARMS = {"viperx": "ViperX 300", "ur5e": "UR5e"}
+WATCHED = ("unplugged", "silent", "overload", "frozen", "nan", "protective-stop")  # of devices that no longer answer
+WATCHDOG_CASES = 4  # of each
 STILL_S = 0.5  # after a stop, in which nothing may be executed any more
 HOLD_COMMANDS = 2  # that a stop itself may execute, at the present position
 SPEED_TOLERANCE = 1.1  # of executed speeds: servos count whole units, the last step of a stop included
@@ -67,12 +74,13 @@ class Outcome:
     executed: FloatArray  # commands that the device executed, (N, J + 1)
     after: int  # further ones, `STILL_S` later
     limp: bool
+    late: float | None = None  # seconds from the fault to the last command that the device executed
 
 
 class Bench:
     """An emulated cell, started anew where a fault has broken it."""
 
-    def __init__(self, kind: str, folder: Path):
+    def __init__(self, kind: str, folder: Path, real_time: bool):
         name, model, base, parked, self.middle, pace = CELLS[kind]
         path = folder / f"{kind}.toml"
         path.write_text(
@@ -80,7 +88,7 @@ class Bench:
             f"[[arms]]\nname = '{name}'\nmodel = '{model}'\nbase = {list(base)}\npark = {list(parked)}\n"
             f"driver = {{ kind = '{kind}' }}\n[emulation]\npace = {pace}\n"
         )
-        self.name, self._config = name, CellConfig.load(path)
+        self.name, self._config, self._real_time = name, CellConfig.load(path), real_time
         self._context, self._emulation = None, None
 
     def ready(self) -> Emulation:
@@ -92,12 +100,24 @@ class Bench:
         with Station(self._emulation.config) as station:
             if not is_parked(station) and (stopped := park(station, StopRequest(), 1.0).stopped):
                 raise SystemExit(f"the emulated arm could not be parked for the next case: {stopped}; run again")
+        if self._real_time:
+            return replace(self._emulation, config=in_real_time(self._emulation.config))
         return self._emulation
 
     def close(self) -> None:
         if self._context is not None:
             self._context.__exit__(None, None, None)
         self._context = self._emulation = None
+
+
+def in_real_time(config: CellConfig) -> CellConfig:
+    """``config`` with the rate and the timeouts of real devices at the ports of the emulated ones."""
+
+    def real(driver: DeviceConfig) -> DeviceConfig:
+        ports = {key: value for key, value in driver.options.items() if key in ("port", "address")}
+        return replace(driver, options=MappingProxyType(ports))
+
+    return replace(config, arms=tuple(replace(arm, driver=real(arm.driver)) for arm in config.arms), emulation=None)
 
 
 @dataclass(frozen=True)
@@ -134,12 +154,18 @@ def during_motion(fault: str) -> Callable[[Case], Outcome]:
 
     def inject(case: Case) -> Outcome:
         emulation = case.bench.ready()
-        begun = len(emulation.commands())
+        begun, since = len(emulation.commands()), [math.inf]
+
+        def fail() -> None:
+            since[0] = emulation.fault(case.bench.name, fault)
+
         with Station(emulation.config) as station:
             motion = case.motion(station)
-            with _at(emulation, begun + case.moment(motion), lambda: emulation.fault(case.bench.name, fault)):
+            with _at(emulation, begun + case.moment(motion), fail):
                 played = station.play(motion, StopRequest())
-        return _judged(case, emulation, begun, played)
+        if math.isinf(since[0]):
+            raise SystemExit(f"stopped before the fault, this computer is too busy: {played.stopped}; run again")
+        return replace(_judged(case, emulation, begun, played), late=max(emulation.times()[-1] - since[0], 0.0))
 
     return inject
 
@@ -336,7 +362,9 @@ def outside_limits(executed: FloatArray, arm: Arm, config: CellConfig) -> str:
         if not np.isfinite(executed).all():
             return "not a number"
         check_joint_range(joints[:, 0], arm, config.rate_hz)
-        Space([arm], config.limits).check(joints, config.rate_hz)
+        space = Space([arm], config.limits)
+        on_its_way_in = (space.outside(joints) > ROUNDING_M).all()  # from the park pose, when it was stopped
+        space.check(joints, config.rate_hz, to_home=on_its_way_in)
     except RipError as error:
         return str(error)
     steps = np.abs(np.diff(joints[:, 0], axis=0)).max(axis=1)
@@ -352,15 +380,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one case of each fault")
     parser.add_argument("--kinds", nargs="*", help="only these")
+    parser.add_argument("--watchdog", action="store_true", help="how long an arm goes on, at the rate of real devices")
     parser.add_argument("--rows", type=Path, default=Path("runs/robot-faults.jsonl"))
     parser.add_argument("--out", type=Path, default=Path("docs/tables/robot_faults.md"))
     options = parser.parse_args()
     options.rows.parent.mkdir(parents=True, exist_ok=True)
     rows = [json.loads(line) for line in options.rows.read_text().splitlines()] if options.rows.exists() else []
     done = {(row["fault"], row["arm"], row["seed"]) for row in rows}
-    kinds = [kind for kind in KINDS if not options.kinds or kind.name in options.kinds]
+    kinds = [kind for kind in KINDS if kind.name in (options.kinds or [one.name for one in KINDS])]
+    if options.watchdog:
+        kinds = [replace(kind, cases=WATCHDOG_CASES) for kind in kinds if kind.name in WATCHED]
     with tempfile.TemporaryDirectory() as folder:
-        benches = {name: Bench(name, Path(folder)) for name in CELLS}
+        benches = {name: Bench(name, Path(folder), options.watchdog) for name in CELLS}
         try:
             for kind in kinds:
                 for seed in range(1 if options.quick else kind.cases):
@@ -374,7 +405,7 @@ def main() -> None:
             for bench in benches.values():
                 bench.close()
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(table(rows))
+    options.out.write_text(watchdog_table(rows) if options.watchdog else table(rows))
     print(options.out.read_text())
 
 
@@ -399,11 +430,22 @@ def one(kind: Kind, seed: int, bench: Bench) -> dict:
     }
 
 
+def watchdog_table(rows: list[dict]) -> str:
+    lines = [
+        "| fault | arm | cases | last command after the fault: median | worst |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for fault, arm in dict.fromkeys((row["fault"], row["arm"]) for row in rows):
+        late = [1e3 * row["late"] for row in rows if (row["fault"], row["arm"]) == (fault, arm)]
+        lines.append(f"| {fault} | {ARMS[arm]} | {len(late)} | {np.median(late):.0f} ms | {max(late):.0f} ms |")
+    load = f"{os.cpu_count()} cores; load of the machine at the end {os.getloadavg()[0]:.1f}."
+    return "\n".join([*lines, "", load]) + "\n"
+
+
 def table(rows: list[dict]) -> str:
     head = ("fault", "arm", "cases", "stopped or refused", "ended as planned", "commands outside the limits",
             "moved on", "torque switched off", "path lost")  # fmt: skip
     lines = [f"| {' | '.join(head)} |", f"| {' | '.join('---' for _ in head)} |"]
-    arms = {"viperx": "ViperX 300", "ur5e": "UR5e"}
     groups = {(row["fault"], row["arm"]): [] for row in rows}
     for row in rows:
         groups[row["fault"], row["arm"]].append(row)
@@ -417,7 +459,7 @@ def table(rows: list[dict]) -> str:
             sum(row["limp"] for row in cases),
             sum(not row["kept"] for row in cases),
         )
-        lines.append(f"| {fault} | {arms.get(arm, '')} | {' | '.join(map(str, counts))} |")
+        lines.append(f"| {fault} | {ARMS.get(arm, '')} | {' | '.join(map(str, counts))} |")
     return "\n".join(lines) + "\n"
 
 

@@ -30,8 +30,8 @@ name = "left"
 model = "viperx-300"
 base = [-0.469, 0, 0, 0, 0, 0]
 park = {park}
-driver = {{ kind = "viperx", port = "{follower}", timeout_ms = 300 }}
-leader = {{ kind = "aloha", port = "{leader}", timeout_ms = 300 }}
+driver = {{ kind = "viperx", port = "{follower}", timeout_ms = 600 }}
+leader = {{ kind = "aloha", port = "{leader}", timeout_ms = 600 }}
 
 [camera]
 kind = "folder"

@@ -103,10 +103,10 @@ def connected():
     """A function that connects a camera to a software device; both are stopped after the test."""
     opened = []
 
-    def connect(image, **facts):
+    def connect(image, timeout_s=20.0, **facts):  # the device's thread shares the processor with others
         device = SoftwareDevice(image, **facts)
         opened.append(device)
-        camera = RealSenseCamera(device=device.device)
+        camera = RealSenseCamera(device=device.device, timeout_s=timeout_s)
         camera.connect()
         opened.append(camera)
         return camera, device
@@ -174,7 +174,7 @@ def test_the_distortion_of_the_lens_is_undone(connected):
 
 
 def test_an_unplugged_and_a_frozen_camera_are_told(connected):
-    camera, device = connected(grey)
+    camera, device = connected(grey, timeout_s=4.0)
     camera.read()
     still = grey()
     device.image = lambda: still
@@ -182,7 +182,7 @@ def test_an_unplugged_and_a_frozen_camera_are_told(connected):
     with pytest.raises(RobotError, match="012345 repeats the same image"):
         camera.read()
     device.stop()
-    with pytest.raises(RobotError, match="no new pair of colour and depth for 1 s: check the cable"):
+    with pytest.raises(RobotError, match="no new pair of colour and depth for 4 s: check the cable"):
         camera.read()
 
 
@@ -226,6 +226,19 @@ def test_a_lerobot_camera_is_read_in_metres_and_only_with_aligned_depth():
     assert frame.depth.max() == pytest.approx(0.8)
     with pytest.raises(RobotError, match=r"no depth that is aligned"):
         LeRobotCamera("top", Shape(), INTRINSICS, aligned=False).connect()
+
+
+def test_a_lerobot_camera_that_repeats_its_image_is_frozen():
+    device = Shape()
+    camera = LeRobotCamera("top", device, INTRINSICS, aligned=True)
+    camera.connect()
+    rng = np.random.default_rng(0)
+    device.read = lambda: rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    for _ in range(2):
+        last = camera.read().rgb
+    device.read = lambda: last
+    with pytest.raises(RobotError, match="top repeats the same image: it is frozen"):
+        camera.read()
 
 
 def test_a_folder_is_replayed_in_order_and_ends(tmp_path):

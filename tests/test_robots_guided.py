@@ -254,7 +254,7 @@ def test_the_command_measures_a_gripper_by_touching_a_point_with_both_fingers(tm
     monkeypatch.setattr("robust_instant_policy.commands.calibrate.Terminal", person)
     monkeypatch.setattr("robust_instant_policy.commands.calibrate.CellConfig.load", lambda path: cell.config)
     monkeypatch.setattr(
-        "robust_instant_policy.commands.calibrate.emulated", lambda config: nullcontext(Emulated(config))
+        "robust_instant_policy.commands.calibrate.devices_of", lambda config: nullcontext((config, None))
     )
     try:
         out = tmp_path / "gripper.toml"
@@ -263,10 +263,3 @@ def test_the_command_measures_a_gripper_by_touching_a_point_with_both_fingers(tm
         np.testing.assert_allclose(read_tool(out)[:3, 3], TIP[:3, 3], atol=0.002)
     finally:
         cell.unplug()
-
-
-class Emulated:
-    """The devices of the cell are emulated in this process."""
-
-    def __init__(self, config):
-        self.config = config

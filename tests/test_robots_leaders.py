@@ -163,21 +163,6 @@ class Teleoperator:
         """Nothing to close."""
 
 
-def test_a_lerobot_teleoperator_leads_by_its_degrees(cell):
-    closed, opened = np.radians([0.0, 100.0])
-    JointMap(np.arange(6), np.ones(6), np.zeros(6), 6, opened, closed).save(cell.file.parent / "so101.toml")
-    table = {"factory": f"{__name__}:Teleoperator", "calibration": "so101.toml"}
-    leader = leader_of(cell, kind="lerobot", keys=" ".join(f"{name}.pos" for name in Teleoperator.names), **table)
-    leader.connect()
-    leader.start()
-    command = leader.read(follower())
-    np.testing.assert_allclose(command.joints, PARK, atol=1e-4)
-    assert command.finger_travel == pytest.approx(TRAVEL / 2)
-    wrong = leader_of(cell, kind="lerobot", keys="shoulder.pos " * 7, **table)
-    with pytest.raises(RobotError, match=r"has no shoulder\.pos.*it has elbow\.pos"):
-        wrong.read(follower())
-
-
 def test_keys_move_the_tool_along_the_worlds_axes_and_never_run_away(cell):
     typed = ["", "ii ", "", "k" * 100]
     leader = leader_of(cell, kind="keyboard", pressed=lambda keys: typed.pop(0) if typed else "i")
@@ -188,6 +173,11 @@ def test_keys_move_the_tool_along_the_worlds_axes_and_never_run_away(cell):
     np.testing.assert_allclose(tool(forward.joints)[:3, 3] - tool(PARK)[:3, 3], [0.008, 0, 0], atol=1e-3)
     assert forward.finger_travel == 0.0
     np.testing.assert_array_equal(leader.read(follower()).joints, forward.joints)
+    held = replace(follower(), finger_travel=0.6 * TRAVEL, grip_load=0.8)
+    leader.start()
+    assert leader.read(held).finger_travel == 0.0  # what it holds would fall
+    leader.start()
+    assert leader.read(follower()).finger_travel == TRAVEL
     for _ in range(50):  # the follower does not move: something is in its way
         command = leader.read(follower())
     assert np.linalg.norm(tool(command.joints)[:3, 3] - tool(PARK)[:3, 3]) < 0.04
@@ -210,6 +200,23 @@ def test_a_gamepad_moves_the_tool_and_its_button_the_gripper(cell, tmp_path):
     os.close(wire)
     with pytest.raises(RobotError, match="unplugged"):
         leader.read(follower())
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"signs": np.full(6, 0.5)}, r"signs must be 1 or -1 for each joint"),
+        ({"gripper_channel": 3}, r"channels must be different numbers"),
+        ({"gripper_channel": 7}, r"has 7 channels, 0 to 6; its calibration reads channel 7: run rip calibrate leader"),
+    ],
+)
+def test_a_calibration_that_is_not_of_this_leader_is_told_before_it_leads(cell, change, words):
+    sound = JointMap(np.arange(6), np.ones(6), np.zeros(6), 6, 1.7, 0.0)
+    replace(sound, **change).save(cell.file.parent / "so101.toml")
+    keys = " ".join(f"{name}.pos" for name in Teleoperator.names)
+    table = {"factory": f"{__name__}:Teleoperator", "calibration": "so101.toml", "keys": keys}
+    with pytest.raises((CellError, RobotError), match=words):
+        leader_of(cell, kind="lerobot", **table).connect()
 
 
 def test_a_leader_that_is_missing_or_not_calibrated_is_told(cell):

@@ -12,11 +12,14 @@ pytest.importorskip("dynamixel_sdk")
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.errors import RobotError, StoppedError
+from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.journal import Journal
 from robust_instant_policy.robots.operator import ENTER
 from robust_instant_policy.robots.recording import APPROACH_RAD_S
+from robust_instant_policy.robots.session import keep_calibration
 from robust_instant_policy.robots.station import Station
 from tests.robot_cell import Cell, Scripted, shown, teaches
+from tests.robots_cells import write_cell
 
 KEEP = [("Enter", ENTER)]
 
@@ -55,6 +58,19 @@ def test_what_the_leader_shows_is_what_the_dataset_holds(cell, tmp_path):
     copies = list((out / "meta" / f"cell-{cell.config.digest}").iterdir())
     assert {file.name for file in copies} == {"cell.toml", "camera.toml"}
     assert any("whether images and paths belong together" in line for line in cell.operator.said)
+
+
+def test_the_files_of_two_arms_are_kept_apart(tmp_path):
+    path = write_cell(tmp_path, "left", "right")
+    text = path.read_text()
+    for name, length in (("left", 0.15), ("right", 0.16)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "gripper.toml").write_text(f"length = {length}\nopening = 0.07\n")
+        text = text.replace(f'name = "{name}"', f'name = "{name}"\ngripper = "{name}/gripper.toml"')
+    path.write_text(text)
+    keep_calibration(CellConfig.load(path), tmp_path / "demos")
+    (kept,) = (tmp_path / "demos" / "meta").glob("cell-*/cell.toml")
+    assert [arm.gripper.length for arm in CellConfig.load(kept).arms] == [0.15, 0.16]
 
 
 def test_a_follower_comes_slowly_to_a_leader_that_is_elsewhere(tmp_path):

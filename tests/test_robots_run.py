@@ -39,17 +39,6 @@ def test_a_plan_is_made_refused_where_it_does_not_belong_and_executed_where_it_d
     assert RunRecord.load(folder).outcome == "planned, not executed"
     assert not (folder / "measured.npz").exists()
 
-    plan = Plan.load(folder / "plan.json")
-    for changed, words in (
-        (replace(plan, cell="0123456789abcdef"), "made for another calibration, gripper or cell"),
-        (replace(plan, confidence=0.3), "confidence is 0.30, the limit is 0.90 (min_confidence in"),
-    ):
-        changed.save(folder / "plan.json")
-        assert run(cell, "--yes", "--plan", str(folder)) == 1
-        assert words in capsys.readouterr().err
-        assert not (folder / "measured.npz").exists()
-
-    plan.save(folder / "plan.json")
     assert run(cell, "--plan", str(folder)) == 2  # nobody is there to be asked
     assert "use --yes" in capsys.readouterr().err
     assert run(cell, "--yes", "--speed", "1", "--plan", str(folder)) == 0
@@ -60,3 +49,30 @@ def test_a_plan_is_made_refused_where_it_does_not_belong_and_executed_where_it_d
     page = (folder / "report.html").read_text()
     assert "Execution: commanded and measured" in page
     assert record.outcome in page
+
+    plan = Plan.load(folder / "plan.json")
+    for changed, words in (
+        (replace(plan, cell="0123456789abcdef"), "made for another calibration, gripper or cell"),
+        (replace(plan, confidence=0.3), "confidence is 0.30, the limit is 0.90 (min_confidence in"),
+    ):
+        changed.save(folder / "plan.json")
+        assert run(cell, "--yes", "--plan", str(folder)) == 1
+        assert words in capsys.readouterr().err
+        assert not (folder / "measured.npz").exists()  # that of the run before
+        assert RunRecord.load(folder).outcome == "planned, not executed"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--plan", "nowhere"], "nowhere holds no plan; make one with: rip run --dry-run --out nowhere"),
+        ([], "--demos DIR is missing"),
+        (["--demos", "data", "--out", "file"], "file is a file; a run needs a folder"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_leaves_nothing(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    assert main(["run", "--robot", "emulated-ur5e", *arguments]) == 2
+    assert words in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import socketserver
+import threading
 
 import numpy as np
 import pytest
 
-from robust_instant_policy.errors import RobotError
+from robust_instant_policy.errors import RobotError, StoppedError
 from robust_instant_policy.motion.guard import plan_guarded
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.client import devices_of
@@ -17,6 +19,8 @@ from robust_instant_policy.robots.station import Station
 from tests.robots_cells import after, reach, write_cell
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no release for Python 3.13")
+
+from robust_instant_policy.robots.followers.ur import GRIPPER_PORT, RobotiqGripper
 
 POINTS = ((0.0, 0.0, 0.05), (0.0, 0.0, 0.01), (0.0, 0.0, 0.05))
 
@@ -78,6 +82,33 @@ def test_a_fault_stops_the_arm_and_a_later_run_works_again(emulated, fault, word
     assert len(emulation.commands()) <= executed + 1
     with Station(config) as station:
         assert not park(station, StopRequest(), 1.0).stopped
+
+
+def test_an_arm_whose_positions_are_not_numbers_is_not_parked(emulated):
+    config, emulation = emulated
+    with Station(config) as station:
+        emulation.fault("hand-e", "nan")
+        while np.isfinite(station.states()[0].joints).all():
+            pass
+        with pytest.raises(StoppedError, match="hand-e measures positions that are not numbers"):
+            park(station, StopRequest(), 1.0)
+
+
+def test_a_garbled_answer_of_the_gripper_is_told():
+    class Garbled(socketserver.StreamRequestHandler):
+        def handle(self):
+            for line in self.rfile:
+                self.wfile.write(b"STA 3\n" if line == b"GET STA\n" else b"P\xff\n")
+
+    address = "127.63.0.1"
+    with socketserver.ThreadingTCPServer((address, GRIPPER_PORT), Garbled) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        gripper = RobotiqGripper(address, 0.025, 100, 5.0)
+        gripper.connect()
+        with pytest.raises(RobotError, match=r"the gripper at 127\.63\.0\.1 answers .*, not three numbers"):
+            gripper.read()
+        gripper.disconnect()
+        server.shutdown()
 
 
 def test_a_lost_network_is_told_and_a_controller_that_is_not_there_is_named(tmp_path):

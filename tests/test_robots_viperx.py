@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from robust_instant_policy.cli import main
-from robust_instant_policy.errors import RobotError
+from robust_instant_policy.errors import RobotError, StoppedError
 from robust_instant_policy.motion.guard import plan_guarded
 from robust_instant_policy.motion.state import Command
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.client import devices_of
 from robust_instant_policy.robots.execution import is_parked, park
-from robust_instant_policy.robots.signals import StopRequest, stop_on_signals
+from robust_instant_policy.robots.signals import REASONS, StopRequest, stop_on_signals
 from robust_instant_policy.robots.station import Station
 from tests.robots_cells import after, reach, write_cell
 
@@ -113,15 +113,21 @@ def test_a_fault_stops_the_arm_where_it_is(emulated, fault, words):
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"), [("unplugged", "was unplugged"), ("overload", "overload; relieve the arm")]
+    ("fault", "words", "known"),
+    [
+        ("unplugged", "was unplugged", "look at the arms"),
+        ("overload", "overload; relieve the arm", "the arms hold their position"),
+    ],
 )
-def test_a_fault_that_lasts_stops_the_arm_and_is_named(own, fault, words):
+def test_a_fault_that_lasts_stops_the_arm_and_is_named(own, fault, words, known):
     config, emulation = own
     with Station(config) as station:
         thread = after(emulation, 40, emulation.fault, "left", fault)
         played = station.play(pick(station), StopRequest())
         thread.join()
     assert re.search(words, played.stopped)
+    with pytest.raises(StoppedError, match=f"{words}.*; {known}"):
+        played.require_end()
 
 
 def test_damaged_packets_now_and_then_do_not_disturb_a_run(emulated):
@@ -140,7 +146,7 @@ def test_a_signal_brakes_the_arm_on_its_path_and_it_keeps_its_torque(emulated, n
         thread = after(emulation, 60, os.kill, os.getpid(), number)
         played = station.play(motion, stop)
         thread.join()
-    assert played.stopped.startswith("stopped (")
+    assert played.stopped == REASONS[number]
     changes = np.diff(played.path.commanded[:, 0, :6], axis=0) * config.rate_hz
     assert np.abs(np.diff(changes, axis=0)).max() * config.rate_hz < station.arms[0].joint_acceleration * 1.06
     assert np.abs(changes[-1]).max() < 0.3  # slow at the end

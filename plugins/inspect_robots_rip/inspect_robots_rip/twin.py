@@ -38,8 +38,8 @@ class Puppet:
         self.waypoints: SimpleQueue[FloatArray | None] = SimpleQueue()
         self.seen: SimpleQueue[Seen | None] = SimpleQueue()
 
-    def act(self, image: np.ndarray, action: FloatArray) -> FloatArray | None:
-        self.seen.put((image, action))
+    def act(self, observation: rip.Observation, action: FloatArray) -> FloatArray | None:
+        self.seen.put((observation.rgb, action))
         return self.waypoints.get()
 
 
@@ -83,9 +83,10 @@ class RipTwin(EmbodimentBase):
         self._end()
         chosen = scene.init_seed if scene.init_seed is not None else seed or 0
         self._scene = self._thread.submit(self._task.reset, chosen).result()
-        self._puppet, self._steps = Puppet(self._task.execute_hz), 0
-        self._episode = self._thread.submit(self._task.follow, self._puppet, MAX_SECONDS)
-        self._episode.add_done_callback(lambda _, ended=self._puppet.seen: ended.put(None))
+        puppet = Puppet(self._task.execute_hz)
+        self._puppet, self._steps = puppet, 0
+        self._episode = self._thread.submit(self._task.follow, puppet, MAX_SECONDS)
+        self._episode.add_done_callback(lambda _: puppet.seen.put(None))
         return self._observe(self._look(), scene.instruction)
 
     def step(self, action: Action) -> StepResult:

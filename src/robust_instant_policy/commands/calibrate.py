@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.commands.console import StageConsole
 from robust_instant_policy.commands.options import positive
-from robust_instant_policy.errors import CellError, StoppedError, UsageError
+from robust_instant_policy.errors import CellError, UsageError
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import make_pose
 from robust_instant_policy.robots.calibration import (
@@ -30,7 +30,7 @@ from robust_instant_policy.robots.calibration.guided import Guide, copied_turns,
 from robust_instant_policy.robots.camera import Camera
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
-from robust_instant_policy.robots.emulation.client import emulated
+from robust_instant_policy.robots.emulation.client import devices_of
 from robust_instant_policy.robots.execution import park
 from robust_instant_policy.robots.leaders import joint_source, make_leader
 from robust_instant_policy.robots.operator import Terminal
@@ -213,17 +213,13 @@ class _Cell:
 
     def park(self) -> None:
         self.terminal.say("the arms go to their park pose")
-        played = park(self.station, self.terminal.stop, self.config.first_run_speed)
-        if played.stopped:
-            raise StoppedError(f"{played.stopped}; the arms hold their position")
+        park(self.station, self.terminal.stop, self.config.first_run_speed).require_end()
 
 
 @contextmanager
 def _open(robot: Path) -> Iterator[_Cell]:
     with ExitStack() as stack:
-        config = CellConfig.load(robot)
-        if config.emulation is not None:
-            config = stack.enter_context(emulated(config)).config
+        config, _ = stack.enter_context(devices_of(CellConfig.load(robot)))
         terminal = stack.enter_context(Terminal(stack.enter_context(stop_on_signals()), StageConsole().say))
         yield _Cell(config, Station(config), terminal)
 

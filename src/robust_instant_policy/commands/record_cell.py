@@ -20,7 +20,7 @@ from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
-from robust_instant_policy.robots.emulation.client import Emulation, emulated
+from robust_instant_policy.robots.emulation.client import Emulation, devices_of
 from robust_instant_policy.robots.leaders import make_leader
 from robust_instant_policy.robots.operator import Terminal
 from robust_instant_policy.robots.session import Session
@@ -37,11 +37,7 @@ def record_cell(options: argparse.Namespace) -> int:
         config = CellConfig.load(options.robot)
         if config.camera is None or config.camera_pose is None:
             raise CellError(f"{options.robot}: the camera is not calibrated; run: rip calibrate camera")
-        emulation = None
-        if config.emulation is not None:
-            with screen.stage("emulated cell"):
-                emulation = stack.enter_context(emulated(config))
-            config = emulation.config
+        config, emulation = stack.enter_context(devices_of(config))
         assert config.camera is not None
         terminal = stack.enter_context(Terminal(stack.enter_context(stop_on_signals()), screen.say))
         station = Station(config)

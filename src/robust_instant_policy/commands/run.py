@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
 from robust_instant_policy.commands.options import RUNS, add_method, method_settings, positive
 from robust_instant_policy.datasets import load_demonstrations
-from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import StoppedError, UsageError
-from robust_instant_policy.files import write_whole
+from robust_instant_policy.files import make_folder, write_whole
 from robust_instant_policy.llm import connect
 from robust_instant_policy.motion.arm import Motion
 from robust_instant_policy.motion.guard import plan_guarded
@@ -29,14 +32,23 @@ from robust_instant_policy.reporting.run import (
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.client import Emulation, devices_of
-from robust_instant_policy.robots.execution import is_parked, observe, park, require_trust
+from robust_instant_policy.robots.execution import (
+    has_open_grippers,
+    is_parked,
+    observe,
+    open_grippers,
+    park,
+    require_trust,
+)
 from robust_instant_policy.robots.signals import stop_on_signals
-from robust_instant_policy.robots.station import Played, Station
+from robust_instant_policy.robots.station import HOLDING, Played, Station
+
+PLANNED, UNJUDGED = "planned, not executed", "executed, not judged"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", type=Path, required=True, metavar="FILE", help="file of the cell")
-    parser.add_argument("--demos", required=True, metavar="DIR", help="folder of demonstrations of this cell")
+    parser.add_argument("--demos", metavar="DIR", help="folder of demonstrations of this cell")
     parser.add_argument(
         "--plan", type=Path, metavar="DIR", help="execute the plan of an earlier --dry-run in this folder"
     )
@@ -57,11 +69,70 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     screen = StageConsole()
     config = CellConfig.load(options.robot)
+    if options.plan is None and options.demos is None:
+        raise UsageError("--demos DIR is missing: the demonstrations to plan from (or --plan DIR, a plan to execute)")
+    if options.plan is not None and not (options.plan / PLAN_FILE).exists():
+        raise UsageError(f"{options.plan} holds no plan; make one with: rip run --dry-run --out {options.plan}")
     out = options.plan or options.out or RUNS / config.name
-    out.mkdir(parents=True, exist_ok=True)
-    with devices_of(config) as (config, emulation):
-        _Run(config, emulation, out, options, screen).run()
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file; a run needs a folder")
+    make_folder(out)
+    with ExitStack() as stack:
+        config, emulation = stack.enter_context(devices_of(config))
+        planner = None if options.plan else stack.enter_context(_Planner.open(config, options, screen))
+        _Run(config, emulation, planner, out, options, screen).run()
+        for number in count(2):
+            if options.plan or options.dry_run or options.yes or not _goes_on():
+                break
+            if emulation is not None:
+                emulation.scene(number - 1 + config.emulation_section().whole("seed", 0))
+            screen.stages.clear()
+            _Run(config, emulation, planner, out.parent / f"{out.name or RUNS.name}-{number}", options, screen).run()
     return 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Planner:
+    """Plans from demonstrations for one scene after another."""
+
+    config: CellConfig
+    screen: StageConsole
+    demonstrations: Sequence[Demonstration]
+    policy: RobustInstantPolicy
+    llm: str
+
+    @classmethod
+    @contextmanager
+    def open(cls, config: CellConfig, options: argparse.Namespace, screen: StageConsole) -> Iterator[_Planner]:
+        """Load the demonstrations and the language model, which is closed with the context."""
+        demonstrations = load_demonstrations(options.demos)
+        with screen.stage(f"language model ({options.llm})"):
+            model = connect(options.llm)
+        with closing(model):
+            policy = RobustInstantPolicy(
+                model,
+                method_settings(options),
+                num_queries=options.queries,
+                deadline_s=options.deadline,
+                progress=screen.done_so_far,
+                workspace=config.limits.workspace,
+            )
+            with screen.stage("keypoints of the demonstrations"):
+                policy.fit(demonstrations)
+            yield cls(config, screen, demonstrations, policy, model.name)
+
+    def plan(self, seen: Observation, out: Path) -> RunRecord:
+        """Plan for what is ``seen``; image, plan and context lie in the run folder ``out`` then."""
+        with self.screen.stage("plan"):
+            plan = replace(self.policy.plan(seen), cell=self.config.digest)
+        make_folder(out)
+        seen.save(out / SEEN_FILE)
+        plan.save(out / PLAN_FILE)
+        save_context(out, [one.observation.rgb for one in self.demonstrations], self.policy.context_.pixels)
+        for note in plan.notes:
+            self.screen.say(f"    {note}")
+        task = self.demonstrations[0].task or self.config.name
+        return RunRecord(task, task, None, self.llm, self.policy.name, None, PLANNED, tuple(self.screen.stages))
 
 
 class _Run:
@@ -71,11 +142,13 @@ class _Run:
         self,
         config: CellConfig,
         emulation: Emulation | None,
+        planner: _Planner | None,
         out: Path,
         options: argparse.Namespace,
         screen: StageConsole,
     ):
-        self._config, self._emulation, self._out, self._options, self._screen = config, emulation, out, options, screen
+        self._config, self._emulation, self._planner = config, emulation, planner
+        self._out, self._options, self._screen = out, options, screen
         self._done = RUNS / "cells" / f"{config.digest}.ok"  # there once a run with this calibration ended well
         self._speed = options.speed or (1.0 if self._done.exists() else config.first_run_speed)
 
@@ -87,17 +160,18 @@ class _Run:
         with station:
             self._park(station)
             motion, record = self._prepare(station)
+            self._open_grippers(station)
             seconds = len(motion.joints) / station.rate_hz
             self._confirm(f"execute {seconds:.0f} s of motion at {100 * self._speed:.0f}% of the usual speed?")
             with self._screen.stage("execution"), stop_on_signals() as stop:
                 played = station.play(motion, stop)
             played.path.save(self._out / MEASURED_FILE)
+            replace(record, outcome=UNJUDGED).save(self._out)  # a person may take long to judge
             success, outcome = self._judge(played)
             grasps = played.path.empty_grasps([arm.name for arm in station.arms])
             self._report(record, success, "; ".join([outcome, *grasps]))
-            if played.stopped:
-                raise StoppedError(f"{played.stopped}; the arms hold their position")
-        if success is not False:
+            played.require_end()
+        if success:  # not where nobody judged it
             write_whole(self._done, b"")
 
     def _park(self, station: Station) -> None:
@@ -106,12 +180,27 @@ class _Run:
         self._confirm("the arms are not at their park pose; move them there slowly?")
         with self._screen.stage("park"), stop_on_signals() as stop:
             played = park(station, stop, min(self._speed, self._config.first_run_speed))
-        if played.stopped:
-            raise StoppedError(f"{played.stopped}; the arms hold their position")
+        played.require_end()
+
+    def _open_grippers(self, station: Station) -> None:
+        """A plan begins with open grippers; the person takes what is still held."""
+        if has_open_grippers(station):
+            return
+        self._confirm("a gripper is closed: hold what it has; open it?")
+        with self._screen.stage("open grippers"), stop_on_signals() as stop:
+            open_grippers(station, stop)
+        if stop.reason:
+            raise StoppedError(f"{stop.reason}; {HOLDING}")
 
     def _prepare(self, station: Station) -> tuple[Motion, RunRecord]:
         """A checked motion, and what is known of the run; the page shows the plan already."""
-        record = RunRecord.load(self._out) if self._options.plan else self._plan()
+        if self._planner is None:
+            record = RunRecord.load(self._out)
+        else:
+            record = self._planner.plan(self._observation(), self._out)
+        record = replace(record, success=None, outcome=PLANNED)
+        record.save(self._out)
+        (self._out / MEASURED_FILE).unlink(missing_ok=True)  # of an earlier run
         plan = Plan.load(self._out / PLAN_FILE)
         page = write_report(self._out)
         self._screen.say(f"the plan, with a confidence of {plan.confidence or 0.0:.2f}: {page}")
@@ -126,41 +215,6 @@ class _Run:
                 self._speed,
             )
         return motion, record
-
-    def _plan(self) -> RunRecord:
-        """Take an image and plan; image, plan and context lie in the run folder then."""
-        demonstrations = load_demonstrations(self._options.demos)
-        seen = self._observation()
-        with self._screen.stage(f"language model ({self._options.llm})"):
-            model = connect(self._options.llm)
-        settings = method_settings(self._options)
-        try:
-            policy = RobustInstantPolicy(
-                model,
-                settings,
-                num_queries=self._options.queries,
-                deadline_s=self._options.deadline,
-                progress=self._screen.done_so_far,
-                workspace=self._config.limits.workspace,
-            )
-            with self._screen.stage("keypoints of the demonstrations"):
-                policy.fit(demonstrations)
-            with self._screen.stage("plan"):
-                plan = replace(policy.plan(seen), cell=self._config.digest)
-        finally:
-            model.close()
-        seen.save(self._out / SEEN_FILE)
-        plan.save(self._out / PLAN_FILE)
-        save_context(self._out, [one.observation.rgb for one in demonstrations], policy.context_.pixels)
-        (self._out / MEASURED_FILE).unlink(missing_ok=True)  # of an earlier run
-        for note in plan.notes:
-            self._screen.say(f"    {note}")
-        task = demonstrations[0].task or self._config.name
-        record = RunRecord(
-            task, task, None, model.name, policy.name, None, "planned, not executed", tuple(self._screen.stages)
-        )
-        record.save(self._out)
-        return record
 
     def _observation(self) -> Observation:
         if self._config.camera is None:
@@ -181,8 +235,11 @@ class _Run:
             failure = self._emulation.failure()
             return not failure, f"failed: {failure}" if failure else "success"
         if self._options.yes:
-            return None, "executed, not judged"
-        success = _agrees("did it succeed?")
+            return None, UNJUDGED
+        try:
+            success = _agrees("did it succeed?")
+        except (StoppedError, KeyboardInterrupt):
+            return None, UNJUDGED
         return success, "success" if success else "failed: judged so"
 
     def _report(self, record: RunRecord, success: bool | None, outcome: str) -> None:
@@ -199,7 +256,17 @@ class _Run:
 def _agrees(question: str) -> bool:
     if not sys.stdin.isatty():
         raise UsageError("there is no terminal to ask on; use --yes to execute without asking")
-    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+    try:
+        return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        raise StoppedError("the terminal was closed; the arms hold") from None
+
+
+def _goes_on() -> bool:
+    try:
+        return _agrees("arrange the next scene; go on?")
+    except StoppedError:  # the terminal was closed
+        return False
 
 
 def _share(text: str) -> float:

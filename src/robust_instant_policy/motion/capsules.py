@@ -65,7 +65,8 @@ def segment_distance(a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike) -> 
 class ArmShape:
     """The links of an arm as capsules, for any joint angles.
 
-    ``near_table (C,)`` is False for links that only turn about the arm's first joint: they stand on the table;
+    ``fixed (C,)`` marks the base; ``near_table (C,)`` is False for it and for links that only turn about the arm's
+    first joint: they stand on the table;
     ``hand (C,)`` marks those beyond the last joint, which work at the table.
     """
 
@@ -74,22 +75,21 @@ class ArmShape:
         self._model, self._data, self._base = model, mujoco.MjData(model), kinematics.base
         self._num_joints = kinematics.num_joints
         depth = np.array([_joints_above(model, body, self._num_joints) for body in range(model.nbody)])
-        self._geoms = np.flatnonzero(depth[model.geom_bodyid] >= 1)
-        self.near_table = depth[model.geom_bodyid[self._geoms]] >= 2
-        self.hand = depth[model.geom_bodyid[self._geoms]] >= self._num_joints
-        shapes = [_enclosing(model, geom) for geom in self._geoms]
+        depth = depth[model.geom_bodyid]
+        self.fixed, self.near_table, self.hand = depth == 0, depth >= 2, depth >= self._num_joints
+        shapes = [_enclosing(model, geom) for geom in range(model.ngeom)]
         self._local = np.array([(start, stop) for start, stop, _ in shapes]).reshape(-1, 2, 3)
         self.radius = np.array([radius for _, _, radius in shapes])
 
     def at(self, joints: ArrayLike) -> Capsules:
         """The capsules ``(N, C)`` in the world at ``joints (N, J)``."""
         joints = np.atleast_2d(np.asarray(joints, dtype=np.float64))
-        ends = np.empty((len(joints), len(self._geoms), 2, 3))
+        ends = np.empty((len(joints), self._model.ngeom, 2, 3))
         for row, angles in enumerate(joints):
             self._data.qpos[: self._num_joints] = angles
             mujoco.mj_kinematics(self._model, self._data)
-            rotation = self._data.geom_xmat[self._geoms].reshape(-1, 3, 3)
-            ends[row] = self._local @ rotation.swapaxes(1, 2) + self._data.geom_xpos[self._geoms, None]
+            rotation = self._data.geom_xmat.reshape(-1, 3, 3)
+            ends[row] = self._local @ rotation.swapaxes(1, 2) + self._data.geom_xpos[:, None]
         ends = transform_points(self._base, ends)
         return Capsules(ends[:, :, 0], ends[:, :, 1], self.radius)
 
@@ -104,7 +104,7 @@ def _joints_above(model: mujoco.MjModel, body: int, num_joints: int) -> int:
     return count
 
 
-def _enclosing(model: mujoco.MjModel, geom: int | np.integer) -> tuple[FloatArray, FloatArray, float]:
+def _enclosing(model: mujoco.MjModel, geom: int) -> tuple[FloatArray, FloatArray, float]:
     """A capsule around a shape, in its frame: both ends ``(3,)`` and the radius."""
     size = model.geom_size[geom]
     if model.geom_type[geom] in LINES:

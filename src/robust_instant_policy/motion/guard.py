@@ -90,8 +90,11 @@ def retimed(motion: Motion, arms: Sequence[Arm], rate_hz: float, speed: float = 
     raise UnreachableError(f"{reason}; the motion would have to be {total:.1f} times slower")
 
 
-def check_motion(motion: Motion, arms: Sequence[Arm], limits: Limits, rate_hz: float) -> None:
-    """Refuse commands that are not finite, or outside the limits of joints, speeds, workspace, table and distances."""
+def check_motion(motion: Motion, arms: Sequence[Arm], limits: Limits, rate_hz: float, to_home: bool = False) -> None:
+    """Refuse commands that are not finite, or outside the limits of joints, speeds, workspace, table and distances.
+
+    A motion ``to_home`` may leave the workspace, see `Space.check`.
+    """
     if not (np.isfinite(motion.joints).all() and np.isfinite(motion.fingers).all()):
         raise UnreachableError("the motion holds commands that are not numbers; plan again")
     needed, reason = _slowdown(motion, arms, rate_hz)
@@ -99,7 +102,7 @@ def check_motion(motion: Motion, arms: Sequence[Arm], limits: Limits, rate_hz: f
         raise UnreachableError(reason)
     for index, arm in enumerate(arms):
         check_joint_range(motion.joints[:, index], arm, rate_hz)
-    Space(arms, limits).check(motion.joints, rate_hz)
+    Space(arms, limits).check(motion.joints, rate_hz, to_home)
 
 
 def check_joint_range(joints: FloatArray, arm: Arm, rate_hz: float) -> None:
@@ -120,14 +123,18 @@ class Space:
         self._arms, self._limits = arms, limits
         self._shapes = [ArmShape(arm.kinematics) for arm in arms]
 
-    def check(self, joints: FloatArray, rate_hz: float) -> None:
-        """Refuse ``joints (N, A, J)`` with a tool outside the workspace, a link at the table, or two arms together."""
+    def check(self, joints: FloatArray, rate_hz: float, to_home: bool = False) -> None:
+        """Refuse ``joints (N, A, J)`` with a tool outside the workspace, a link at the table, or two arms together.
+
+        A tool may come into the workspace from outside, within `HOME_MARGIN_M` of the box around workspace and home;
+        with ``to_home`` it may be anywhere in that box before and after its time in the workspace.
+        """
         limits = self._limits
         capsules = [shape.at(joints[:, index]) for index, shape in enumerate(self._shapes)]
         for index, (arm, shape, links) in enumerate(zip(self._arms, self._shapes, capsules, strict=True)):
             poses = np.array([arm.kinematics.tool_pose(angles) for angles in joints[:, index]])
             points = arm.triangle.triplets(poses)[:, 1:]
-            _check_workspace(points, arm, limits, rate_hz)
+            _check_workspace(points, arm, limits, rate_hz, to_home)
             depth = -points[..., 2].min(axis=-1)
             what = "a fingertip goes"
             _refuse(depth - limits.table_depth, depth, limits.table_depth, arm, what, "m below the table",
@@ -137,10 +144,20 @@ class Space:
             least = height[:, shape.near_table].min(axis=1)
             _refuse(-least, least, 0.0, arm, "a link has a height above the table of", "m", "model", rate_hz)
         for one, other in combinations(range(len(self._arms)), 2):
-            apart = capsules[one].distances(capsules[other]).min(axis=(1, 2))
+            apart = capsules[one].distances(capsules[other])
+            apart[:, self._shapes[one].fixed[:, None] & self._shapes[other].fixed] = np.inf  # nothing moves there
+            apart = apart.min(axis=(1, 2))
             what = f"its distance from {self._arms[other].name} is"
             _refuse(limits.arm_distance - apart, apart, limits.arm_distance, self._arms[one], what, "m",
                     "arm_distance", rate_hz)  # fmt: skip
+
+    def outside(self, joints: FloatArray) -> FloatArray:
+        """How far, metres, each tool is outside the workspace at ``joints (N, A, J)``: ``(N, A)``, 0 inside."""
+        columns = []
+        for index, arm in enumerate(self._arms):
+            poses = np.array([arm.kinematics.tool_pose(angles) for angles in joints[:, index]])
+            columns.append(_outside(arm.triangle.triplets(poses)[:, 1:], self._limits))
+        return np.stack(columns, axis=1).clip(0.0)
 
 
 def joint_motion(start: FloatArray, goal: FloatArray, fingers: FloatArray, arms: Sequence[Arm], rate_hz: float,
@@ -167,7 +184,7 @@ def park_motion(start: FloatArray, fingers: FloatArray, arms: Sequence[Arm], lim
     home = np.stack([arm.home for arm in arms])
     direct = retimed(joint_motion(start, home, fingers, arms, rate_hz), arms, rate_hz, speed)
     try:
-        check_motion(direct, arms, limits, rate_hz)
+        check_motion(direct, arms, limits, rate_hz, to_home=True)
         return direct
     except UnreachableError as refused:
         raised = []
@@ -181,7 +198,7 @@ def park_motion(start: FloatArray, fingers: FloatArray, arms: Sequence[Arm], lim
         detour = Motion(*(np.concatenate([getattr(part, name) for part in parts]) for name in _FIELDS))
         detour = retimed(detour, arms, rate_hz, speed)
         try:
-            check_motion(detour, arms, limits, rate_hz)
+            check_motion(detour, arms, limits, rate_hz, to_home=True)
         except UnreachableError:
             raise UnreachableError(f"the way to the park pose is refused ({refused}); move the arm by hand") from None
         return detour
@@ -237,24 +254,35 @@ def _slowdown(motion: Motion, arms: Sequence[Arm], rate_hz: float) -> tuple[floa
     return worst, reason
 
 
-def _check_workspace(fingertips: FloatArray, arm: Arm, limits: Limits, rate_hz: float | None) -> None:
-    """Refuse ``fingertips (N, 2, 3)`` outside the workspace, but on the way from and to the arm's home."""
-    low, high = limits.workspace[0].copy(), limits.workspace[1]
-    low[2] = min(low[2], -limits.table_depth)  # the table has a limit of its own
+def _check_workspace(
+    fingertips: FloatArray, arm: Arm, limits: Limits, rate_hz: float | None, to_home: bool = False
+) -> None:
+    """Refuse ``fingertips (N, 2, 3)`` outside the workspace, but on the way from the arm's home or ``to_home``."""
     home = arm.triangle.triplets(arm.home_pose)[1:]
-    outside = np.maximum(low - fingertips, fingertips - high).max(axis=(1, 2))
-    beyond = np.maximum(
-        np.minimum(low, home.min(axis=0)) - HOME_MARGIN_M - fingertips,
-        fingertips - np.maximum(high, home.max(axis=0)) - HOME_MARGIN_M,
-    ).max(axis=(1, 2))
+    outside = _outside(fingertips, limits)
+    excess = _outside(fingertips, limits, home) - HOME_MARGIN_M
     inside = np.flatnonzero(outside <= ROUNDING_M)
-    excess = beyond
-    if len(inside):
-        excess[inside[0] : inside[-1]] = outside[inside[0] : inside[-1]]
+    if to_home:
+        way_in, way_out = (inside[0], inside[-1]) if len(inside) else (0, 0)
+    else:
+        way_in, way_out = inside[0] if len(inside) else 0, len(outside)
+    excess[way_in:way_out] = outside[way_in:way_out]
     if excess.max() > ROUNDING_M:
         step = int(np.argmax(excess))
         what = "its tool is outside the workspace by"
         raise UnreachableError(exceeded(_when(arm, step, rate_hz), what, float(excess[step]), 0.0, "m", "workspace"))
+
+
+def _outside(fingertips: FloatArray, limits: Limits, home: FloatArray | None = None) -> FloatArray:
+    """How far, metres, ``fingertips (N, 2, 3)`` are outside the workspace: ``(N,)``, negative inside.
+
+    With fingertips ``home (2, 3)``, how far they are outside the box around both.
+    """
+    low, high = limits.workspace[0].copy(), limits.workspace[1]
+    low[2] = min(low[2], -limits.table_depth)  # the table has a limit of its own
+    if home is not None:
+        low, high = np.minimum(low, home.min(axis=0)), np.maximum(high, home.max(axis=0))
+    return np.maximum(low - fingertips, fingertips - high).max(axis=(1, 2))
 
 
 def _refuse(excess: FloatArray, values: FloatArray, limit: float, arm: Arm, what: str, unit: str, key: str,

@@ -60,8 +60,9 @@ class Kinematics:
 
     @property
     def joint_range(self) -> FloatArray:
-        """Lowest and highest angle ``(J, 2)`` of each joint, rad."""
-        return self.model.jnt_range[: self.num_joints].copy()
+        """Lowest and highest angle ``(J, 2)`` of each joint, rad; infinite for one that turns without end."""
+        limited = self.model.jnt_limited[: self.num_joints, None].astype(bool)
+        return np.where(limited, self.model.jnt_range[: self.num_joints], [-np.inf, np.inf])
 
     def tool_pose(self, joints: ArrayLike) -> FloatArray:
         """Tool pose ``(4, 4)`` in the world at ``joints (J,)``."""

@@ -21,7 +21,8 @@ from robust_instant_policy.motion.checks import check_clearance, check_joint_cha
 from robust_instant_policy.trajectory import Trajectory
 
 LEAD_IN_SPEED_M_S = 0.35  # from home to the first waypoint
-GRIPPER_SECONDS = 0.45  # to open or close completely, with a margin
+GRIPPER_SECONDS = 0.45  # to open or close completely, with a margin; longer for slow fingers
+GRIPPER_MARGIN = 1.1  # of that time over the one that the fingers need; simulated fingers need 0.4 s at most
 SETTLE_SECONDS = 0.5  # at the last waypoint, before success is judged
 CLOSED = 0.5  # gripper states above this count as closed
 
@@ -77,11 +78,12 @@ class _Schedule:
     ) -> None:
         """Move through ``waypoints (N, A, 4, 4)``, with a dwell at each where a state of ``closed (N, A)`` changes."""
         speed = min(arm.tool_speed for arm in arms) / 2  # the cubic is up to twice as fast as its mean
+        dwell = max(GRIPPER_SECONDS, GRIPPER_MARGIN * max(arm.finger_travel / arm.finger_speed for arm in arms))
         for step, (poses, wanted) in enumerate(zip(waypoints, closed, strict=True)):
             if step or not already_at_first:
                 self.go(poses, step, speed)
             if (wanted != self.closed[-1]).any():
-                self.dwell(GRIPPER_SECONDS, wanted)
+                self.dwell(dwell, wanted)
 
     def go(self, poses: FloatArray, step: int, speed: float) -> None:
         """Move to ``poses`` in one interval, or longer if that would exceed ``speed`` m/s."""

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
 
 
@@ -21,6 +22,12 @@ class Frame:
     depth: NDArray[np.float32]
     intrinsics: FloatArray
     timestamp: float
+
+
+def check_alive(camera: str, rgb: NDArray[np.uint8], before: NDArray[np.uint8] | None) -> None:
+    """Raises `RobotError` for an image that repeats the one ``before``: noise makes any two images differ."""
+    if before is not None and np.array_equal(before, rgb) and rgb.std() > 0:
+        raise RobotError(f"{camera} repeats the same image: it is frozen; unplug it and connect it again")
 
 
 class Camera(Protocol):

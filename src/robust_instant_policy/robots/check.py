@@ -7,17 +7,18 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robust_instant_policy.errors import RipError
+from robust_instant_policy.errors import RipError, RobotError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.robots.calibration import check_camera
+from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
-from robust_instant_policy.robots.station import Station
+from robust_instant_policy.robots.execution import MIN_DEPTH_SHARE
+from robust_instant_policy.robots.station import START_RAD, Station
 
 READINGS = 100
 FRAMES = 3
 JITTER_S = 5e-3  # largest accepted difference from the rate, of 95% of the readings
-AT_PARK_RAD = 0.15
-MIN_DEPTH_SHARE = 0.5  # of the pixels of an image
 
 
 def check_cell(config: CellConfig, say: Callable[[str], object]) -> int:
@@ -31,7 +32,7 @@ def check_cell(config: CellConfig, say: Callable[[str], object]) -> int:
         except RipError as error:
             say(f"  WRONG {error}")
             bad += 1
-    say("everything is well" if not bad else f"{bad} things to mend")
+    say("everything is well" if not bad else f"{bad} thing{'s' * (bad > 1)} to mend")
     return int(bad > 0)
 
 
@@ -62,7 +63,7 @@ def _timing(name: str, slow: float, rate_hz: float) -> str:
 
 def _at_park(name: str, away: FloatArray) -> tuple[str, bool]:
     worst = int(np.argmax(np.abs(away)))
-    if abs(away[worst]) < AT_PARK_RAD:
+    if abs(away[worst]) < START_RAD:
         return f"{name}: at its park pose", True
     return (
         f"{name}: joint {worst + 1} is {away[worst]:+.2f} rad away from the park pose; `rip run` moves it there first",
@@ -92,9 +93,15 @@ def _camera(config: CellConfig) -> list[tuple[str, bool]]:
             share >= MIN_DEPTH_SHARE,
         ),
         (f"camera {camera.name}: its clock advances", len({frame.timestamp for frame in frames}) == FRAMES),
-        (
-            f"camera {camera.name}: "
-            + ("calibrated" if config.camera_pose is not None else "not calibrated; run: rip calibrate camera"),
-            config.camera_pose is not None,
-        ),
+        _calibration(config, camera.name, frames[-1]),
     ]
+
+
+def _calibration(config: CellConfig, name: str, frame: Frame) -> tuple[str, bool]:
+    if config.camera_calibration is None or config.camera_pose is None:
+        return f"camera {name}: not calibrated; run: rip calibrate camera", False
+    try:
+        check_camera(config.camera_calibration, name, frame)
+    except RobotError as error:
+        return str(error), False
+    return f"camera {name}: calibrated", True

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import count
+
 import numpy as np
 
 from robust_instant_policy.checks import is_trusted
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import CellError, RobotError, StoppedError
 from robust_instant_policy.motion.guard import park_motion
+from robust_instant_policy.motion.state import ArmState, Command, is_open
 from robust_instant_policy.robots.calibration import check_camera
 from robust_instant_policy.robots.camera import Camera
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.signals import StopRequest
 from robust_instant_policy.robots.station import START_RAD, Played, Station
 
+OPENING_S, OPENING_MARGIN = 1.0, 1.3  # to open a gripper: at least, and over the time its fingers need
 MIN_DEPTH_SHARE = 0.2  # of the pixels of an image; fewer, and the camera is covered or too close
 
 
@@ -65,9 +70,33 @@ def is_parked(station: Station) -> bool:
     return max(away) <= START_RAD
 
 
+def has_open_grippers(station: Station) -> bool:
+    """Whether all grippers are open, as plans and demonstrations begin."""
+    return all(is_open(state, arm.finger_travel) for state, arm in zip(station.states(), station.arms, strict=True))
+
+
+def open_grippers(station: Station, stop: StopRequest) -> None:
+    """Open all grippers, whatever they hold; arms keep their joints."""
+    steps = count(1)
+    seconds = max(OPENING_S, *(OPENING_MARGIN * arm.finger_travel / arm.finger_speed for arm in station.arms))
+
+    def opening(_: Sequence[ArmState]) -> list[Command] | None:
+        if next(steps) > seconds * station.rate_hz or stop.reason:
+            return None
+        pairs = zip(station.gate.last, station.arms, strict=True)
+        return [Command(told.joints, arm.finger_travel) for told, arm in pairs]
+
+    station.lead(opening)
+
+
 def park(station: Station, stop: StopRequest, speed: float) -> Played:
-    """Move all arms to their park poses; raises `UnreachableError` where the way is refused."""
+    """Move all arms to their park poses, grippers as they are.
+
+    Raises `UnreachableError` where the way is refused, `StoppedError` where an arm is not ready.
+    """
     states = station.states()
+    station.gate.start(states)
     joints = np.stack([state.joints for state in states])
-    fingers = np.array([state.finger_travel for state in states]).clip(0.0, [arm.finger_travel for arm in station.arms])
+    fingers = np.array([command.finger_travel for command in station.gate.last])
+    fingers = fingers.clip(0.0, [arm.finger_travel for arm in station.arms])
     return station.play(park_motion(joints, fingers, station.arms, station.config.limits, station.rate_hz, speed), stop)

@@ -77,15 +77,16 @@ def arm_of(config: ArmConfig, folder: Path = Path()) -> Arm:
         if config.gripper is None:
             raise CellError(f"{config.name}: gripper is missing; an arm of your own needs its length and opening")
         model = ArmModel(path, config.gripper, **OTHER)
-    spec = mujoco.MjSpec.from_file(str(model.urdf))
-    spec.compiler.fusestatic = False  # the tool frame is a separate link
     try:
+        spec = mujoco.MjSpec.from_file(str(model.urdf))
+        spec.compiler.fusestatic = False  # the tool frame is a separate link
         if config.tool is not None:
             _move_tool(spec.body(TOOL), config.tool)
         compiled = spec.compile()
         compiled.body(TOOL)
     except (ValueError, KeyError, AttributeError) as error:
-        raise CellError(f"{model.urdf} cannot be used: {error}; it needs a link called {TOOL}") from None
+        words = " ".join(str(error).split())
+        raise CellError(f"{model.urdf} cannot be used: {words}; it needs a link called {TOOL}") from None
     count = len(config.park)
     revolute = int(np.cumprod(compiled.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).sum())
     if count == 0 or count > revolute or (config.model in KNOWN and count != revolute):

@@ -41,7 +41,7 @@ class Following:
 
     def __init__(self, station: Station, leaders: Sequence[Leader | None], operator: Operator, coupled: str):
         self._station, self._leaders, self._operator, self._words = station, leaders, operator, coupled
-        self._travels = [arm.finger_travel for arm in station.arms]
+        self._travels: list[float] = []  # of each gripper, open or closed, from the first step on
         self._coupled, self._waited, self._gap = False, 0, np.inf
         self.key = ""
         for leader in leaders:
@@ -56,6 +56,11 @@ class Following:
         if self.key and (self._coupled or self.key != ENTER):
             return None
         last = self._station.gate.last
+        if not self._travels:
+            full = [arm.finger_travel for arm in self._station.arms]
+            self._travels = [
+                most if told.finger_travel > most / 2 else 0.0 for told, most in zip(last, full, strict=True)
+            ]
         if self._coupled:
             self._on_step(last, states)
         wanted = [
@@ -159,7 +164,10 @@ def demonstration_of(
     kept = _moving(poses, closed, rate_hz) if len(poses) else slice(0, 0)
     if kept.stop - kept.start < MIN_STEPS:
         raise DatasetError("nothing was shown: the arms did not move; record it again")
-    trajectory = Trajectory.from_poses(poses[kept], closed[kept], arms[0].triangle)
+    single = [
+        Trajectory.from_poses(poses[kept, i], closed[kept, i], arm.triangle).actions for i, arm in enumerate(arms)
+    ]
+    trajectory = Trajectory.from_actions(np.concatenate(single, axis=1))
     facts: dict[str, str | float | int] = {
         "cell": cell,
         "calibration": episode.calibration,

@@ -5,30 +5,27 @@ park ─▶ start image ─▶ soft start ─▶ demonstration ─▶ kept or di
 
 from __future__ import annotations
 
+import os
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import count as count_from
 from pathlib import Path
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, StoppedError, UnreachableError
 from robust_instant_policy.files import read_regular, write_whole
-from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.camera import Camera
 from robust_instant_policy.robots.cell import CellConfig
-from robust_instant_policy.robots.execution import is_parked, observe, park
+from robust_instant_policy.robots.execution import has_open_grippers, is_parked, observe, open_grippers, park
 from robust_instant_policy.robots.journal import Episode, Journal
 from robust_instant_policy.robots.leader import Leader
 from robust_instant_policy.robots.operator import ENTER, Operator
 from robust_instant_policy.robots.recording import DISCARD, QUIT, demonstration_of, guide, teach
-from robust_instant_policy.robots.station import Station
+from robust_instant_policy.robots.station import HOLDING, Station
 from robust_instant_policy.sanity import check_demonstrations
 
 PREVIEW = "p"
-OPEN = 0.9  # share of its travel from which a gripper is open
-OPENING_S = 1.0
 LATE_S = 5e-3  # deviation of a step that 95% of the steps must keep within
 
 
@@ -147,20 +144,12 @@ class Session:
 
     def _open_grippers(self) -> None:
         """A demonstration begins with open grippers; the person takes what is still held."""
-        station, operator = self.station, self.operator
-        travels = [arm.finger_travel for arm in station.arms]
-        if all(state.finger_travel > OPEN * travel for state, travel in zip(station.states(), travels, strict=True)):
+        operator = self.operator
+        if has_open_grippers(self.station):
             return
         if operator.ask("a gripper is closed: hold what it has; Enter opens it", ENTER) != ENTER:
-            raise StoppedError(f"{operator.stop.reason}; the arms hold their position")
-        steps = count_from()
-
-        def opening(states: Sequence[ArmState]) -> list[Command] | None:
-            if next(steps) > OPENING_S * station.rate_hz or operator.stop.reason:
-                return None
-            return [Command(told.joints, travel) for told, travel in zip(station.gate.last, travels, strict=True)]
-
-        station.lead(opening)
+            raise StoppedError(f"{operator.stop.reason}; {HOLDING}")
+        open_grippers(self.station, operator.stop)
 
     def _park(self) -> None:
         """Move the arms to their park poses; where the way is refused, the person leads them nearer."""
@@ -175,17 +164,19 @@ class Session:
                     raise StoppedError("the arms are not parked; they hold their position") from None
                 guide(station, self.leaders, operator, "coupled: lead the arm towards its park pose; Enter lets go")
                 continue
-            if played.stopped:
-                raise StoppedError(f"{played.stopped}; the arms hold their position")
+            played.require_end()
 
 
 def keep_calibration(config: CellConfig, folder: Path) -> None:
     """Copy the cell's file and its calibration files into the dataset, one folder a calibration."""
-    kept = folder / "meta" / f"cell-{config.digest}"
-    for arm in tomllib.loads(read_regular(config.path).decode())["arms"]:
-        files = [arm.get("gripper"), arm.get("leader", {}).get("calibration")]
-        for name in filter(None, files):
-            write_whole(kept / Path(name).name, read_regular(config.path.parent / name))
-    for file in (config.path, config.camera_calibration):
-        if file is not None:
-            write_whole(kept / file.name, read_regular(file))
+    kept, home = folder / "meta" / f"cell-{config.digest}", config.path.parent
+    tables = tomllib.loads(read_regular(config.path).decode())
+    names = [tables.get("camera", {}).get("calibration")]
+    for arm in tables["arms"]:
+        names += [arm.get("gripper"), arm.get("leader", {}).get("calibration")]
+    for name in filter(None, names):
+        inside = (home / name).resolve().is_relative_to(home.resolve())  # two arms' files may have one name
+        write_whole(
+            kept / (os.path.relpath(home / name, home) if inside else Path(name).name), read_regular(home / name)
+        )
+    write_whole(kept / config.path.name, read_regular(config.path))

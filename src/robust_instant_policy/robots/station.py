@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from types import TracebackType
 
 import numpy as np
 
-from robust_instant_policy.errors import RobotError, StoppedError, UnreachableError
+from robust_instant_policy.errors import CellError, RobotError, StoppedError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.gate import STALE_S, Gate
@@ -28,21 +27,32 @@ from robust_instant_policy.robots.follower import Follower
 from robust_instant_policy.robots.followers import make_follower
 from robust_instant_policy.robots.models import arm_of
 from robust_instant_policy.robots.path import MeasuredPath
-from robust_instant_policy.robots.priority import CONTROL, take_real_time
+from robust_instant_policy.robots.priority import CONTROL, real_time
 from robust_instant_policy.robots.signals import StopRequest
 
-BRAKING_STEPS = 12  # control steps in which a motion is brought to rest when somebody asks for it
-BLENDING_STEPS = 25  # in which the difference between measured joints and the first command is taken back
+BRAKING_S = 0.24  # in which a motion is brought to rest when somebody asks for it
+BLENDING_S = 0.5  # in which the difference between measured joints and the first command is taken back
 START_RAD = 0.1  # largest such difference
-EMULATED_STALE_S = 0.5  # an emulation shares the processor with what uses it
+HOLDING = "the arms hold their position"
+EMULATED_STALE_S = 0.5, 0.2  # at most and at least: an emulation shares the processor with what uses it
 
 
 @dataclass(frozen=True)
 class Played:
-    """The measured path of a motion, and why it was ``stopped``, empty where it came to its end."""
+    """The measured path of a motion, and why it was ``stopped``, empty where it came to its end.
+
+    Where a device does not answer, ``holds`` is False: only its own watchdog can have stopped the arm.
+    """
 
     path: MeasuredPath
     stopped: str
+    holds: bool = True
+
+    def require_end(self) -> None:
+        """Raises `StoppedError` for a motion that was stopped."""
+        if self.stopped:
+            known = HOLDING if self.holds else "look at the arms: those that answer hold, the others by their watchdogs"
+            raise StoppedError(f"{self.stopped}; {known}")
 
 
 class Ticker:
@@ -72,7 +82,11 @@ class Station:
         self.followers: tuple[Follower, ...] = tuple(
             make_follower(arm, one.driver, config.rate_hz) for arm, one in zip(self.arms, config.arms, strict=True)
         )
-        stale_s = STALE_S if config.emulation is None else max(EMULATED_STALE_S / config.pace, 2 * STALE_S)
+        if len({len(arm.home) for arm in self.arms}) > 1:
+            counts = ", ".join(f"{arm.name} {len(arm.home)}" for arm in self.arms)
+            raise CellError(f"{config.path}: the arms of a cell must have as many joints as each other, not {counts}")
+        most, least = EMULATED_STALE_S
+        stale_s = STALE_S if config.emulation is None else max(most / config.pace, least)
         self.sent_at = 0.0  # of the last command, seconds of a clock that does not jump
         self.gate = Gate(self.arms, config.limits, config.rate_hz, stale_s)
 
@@ -87,25 +101,28 @@ class Station:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.stop()
-        self._connected.close()
+        with self._connected:
+            self.stop()
 
     def states(self) -> list[ArmState]:
         """What the arms measure now."""
         return [follower.state() for follower in self.followers]
 
     def stop(self) -> None:
-        """All arms come to rest and hold."""
-        for follower in self.followers:
-            follower.stop()
+        """All arms come to rest and hold, also those after one that fails to."""
+        with contextlib.ExitStack() as stack:
+            for follower in reversed(self.followers):
+                stack.callback(follower.stop)
 
     def play(self, motion: Motion, stop: StopRequest) -> Played:
         """Execute a motion that `motion.guard` has checked, from where the arms are now.
 
         A request to ``stop`` brakes the motion on its path; anything that is wrong stops the arms at once.
         """
-        log = _Log(len(motion.joints) + BRAKING_STEPS, motion.joints.shape[1:])
+        braking, blending = (max(round(seconds * self.rate_hz), 1) for seconds in (BRAKING_S, BLENDING_S))
+        log = _Log(len(motion.joints) + braking, motion.joints.shape[1:])
         last = len(motion.joints) - 1
+        most = np.array([arm.finger_speed for arm in self.arms]) / self.rate_hz
         position, stride, step, offset = -1.0, 1.0, 0, np.zeros(motion.joints.shape[1:])
 
         def command(states: Sequence[ArmState]) -> list[Command] | None:
@@ -113,21 +130,24 @@ class Station:
             if step == 0:
                 offset = self._start_offset(motion, states)
             if stop.reason:
-                stride -= 1 / BRAKING_STEPS
+                stride -= 1 / braking
             if position >= last or stride <= 0:
                 return None
             position, step = min(position + stride, float(last)), step + 1
-            share = max(1 - step / BLENDING_STEPS, 0.0)
-            return _between(motion, position, share**3 * (10 - 15 * share + 6 * share**2) * offset)
+            share = max(1 - step / blending, 0.0)
+            joints, fingers = _between(motion, position)
+            joints = joints + share**3 * (10 - 15 * share + 6 * share**2) * offset
+            before = np.array([one.finger_travel for one in self.gate.last])  # the fingers may begin elsewhere, too
+            fingers = before + np.clip(fingers - before, -most, most)
+            return [Command(one, float(travel)) for one, travel in zip(joints, fingers, strict=True)]
 
-        stopped = ""
+        stopped, holds = "", True
         try:
             self._loop(command, self.gate.admit, log)
-            if stop.reason:
-                stopped = f"stopped ({stop.reason})"
+            stopped = stop.reason
         except (RobotError, UnreachableError) as error:
-            stopped = str(error)
-        return Played(log.path(self.rate_hz, self.arms), stopped)
+            stopped, holds = str(error), isinstance(error, StoppedError | UnreachableError)
+        return Played(log.path(self.rate_hz, self.arms), stopped, holds)
 
     def lead(self, command: Callable[[Sequence[ArmState]], Sequence[Command] | None]) -> None:
         """Let the arms follow ``command(states)``, slowed down by `Gate.limited`, until it returns None."""
@@ -172,13 +192,12 @@ class Station:
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
     """No garbage collection, which may take longer than a control step, and a real-time priority for this thread."""
-    collecting, policy, usual = gc.isenabled(), os.sched_getscheduler(0), os.sched_getparam(0)
+    collecting = gc.isenabled()
     gc.disable()
     try:
-        take_real_time(CONTROL)
-        yield
+        with real_time(CONTROL):
+            yield
     finally:
-        os.sched_setscheduler(0, policy, usual)
         if collecting:
             gc.enable()
 
@@ -215,10 +234,9 @@ class _Log:
         )
 
 
-def _between(motion: Motion, position: float, offset: FloatArray) -> list[Command]:
-    """The commands at a fractional index of ``motion``, with an ``offset (A, J)`` of the joints."""
+def _between(motion: Motion, position: float) -> tuple[FloatArray, FloatArray]:
+    """Joints ``(A, J)`` and finger travel ``(A,)`` at a fractional index of ``motion``."""
     row, share = int(position), position - int(position)
     after = min(row + 1, len(motion.joints) - 1)
-    joints: FloatArray = motion.joints[row] + share * (motion.joints[after] - motion.joints[row]) + offset
-    fingers = motion.fingers[row] + share * (motion.fingers[after] - motion.fingers[row])
-    return [Command(one, float(travel)) for one, travel in zip(joints, fingers, strict=True)]
+    joints: FloatArray = motion.joints[row] + share * (motion.joints[after] - motion.joints[row])
+    return joints, motion.fingers[row] + share * (motion.fingers[after] - motion.fingers[row])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.robots.camera import Frame
+from robust_instant_policy.robots.camera import Frame, check_alive
 
 
 class LeRobotShape(Protocol):
@@ -31,6 +31,7 @@ class LeRobotCamera:
 
     def __init__(self, name: str, device: LeRobotShape, intrinsics: FloatArray, aligned: bool):
         self.name, self._device, self._intrinsics, self._aligned = name, device, intrinsics, aligned
+        self._before: NDArray[np.uint8] | None = None
 
     def connect(self) -> None:
         if not self._aligned or not hasattr(self._device, "read_depth"):
@@ -47,6 +48,8 @@ class LeRobotCamera:
                 f"{self.name} gives depth {depth.shape} {depth.dtype} for an image {rgb.shape}; expected uint16 "
                 "millimetres of the same size"
             )
+        check_alive(self.name, rgb, self._before)
+        self._before = rgb.copy()
         metres = depth.reshape(rgb.shape[:2]).astype(np.float32) * np.float32(1e-3)
         return Frame(rgb, metres, self._intrinsics, time.monotonic())
 

@@ -20,7 +20,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from robust_instant_policy.errors import MissingExtraError, RobotError
 from robust_instant_policy.robots.calibration.board import opencv
-from robust_instant_policy.robots.camera import Frame
+from robust_instant_policy.robots.camera import Frame, check_alive
 
 WARM_UP_FRAMES = 30  # until exposure and white balance are stable: 1 s
 BURST = 6  # frames that the temporal filter combines
@@ -34,7 +34,8 @@ class RealSenseCamera:
     """A D415, D405, D435 or D455; see `robots.camera.Camera`.
 
     ``serial`` empty takes the only one connected. ``burst`` frames are combined into one depth image by the temporal
-    filter; 1 for live pictures. A ``device`` of the SDK may be given instead of a serial number.
+    filter; 1 for live pictures. A ``device`` of the SDK may be given instead of a serial number. `read` waits for a new
+    pair of frames for ``timeout_s``.
     """
 
     def __init__(
@@ -45,13 +46,14 @@ class RealSenseCamera:
         rate_hz: int = 30,
         burst: int = BURST,
         device: Any | None = None,
+        timeout_s: float = TIMEOUT_S,
     ):
         self.name = f"realsense {serial}".strip()
-        self._serial, self._device = serial, device
+        self._serial, self._device, self._timeout_s = serial, device, timeout_s
         self._width, self._height, self._rate_hz, self._burst = width, height, rate_hz, burst
         self._sensors: list[Any] = []
         self._last = (-1, -1)  # numbers of the last depth and colour frame
-        self._last_pixels: NDArray[np.uint8] | None = None
+        self._before: NDArray[np.uint8] | None = None
 
     def connect(self) -> None:
         rs = sdk()
@@ -94,7 +96,8 @@ class RealSenseCamera:
         depth, color = aligned.get_depth_frame(), aligned.get_color_frame()
         rgb = np.array(color.get_data())
         metres = np.asarray(depth.get_data()) * np.float32(depth.get_units())
-        self._check_alive(rgb)
+        check_alive(self.name, rgb, self._before)
+        self._before = rgb
         if self._maps is not None:
             cv2, (columns, rows) = opencv(), self._maps
             rgb = cv2.remap(rgb, columns, rows, cv2.INTER_LINEAR)
@@ -135,7 +138,7 @@ class RealSenseCamera:
 
     def _pair(self) -> Any:
         """The next frameset with new frames of both streams, taken at one time."""
-        deadline = time.monotonic() + TIMEOUT_S
+        deadline = time.monotonic() + self._timeout_s
         while (left := deadline - time.monotonic()) > 0:
             found, frames = self._syncer.try_wait_for_frames(max(round(left * 1e3), 1))
             if not found:
@@ -151,16 +154,9 @@ class RealSenseCamera:
             self._last = numbers
             return frames
         raise RobotError(
-            f"{self.name} has sent no new pair of colour and depth for {TIMEOUT_S:g} s: check the cable and the USB 3 "
-            "port, then connect again"
+            f"{self.name} has sent no new pair of colour and depth for {self._timeout_s:g} s: check the cable and the "
+            "USB 3 port, then connect again"
         )
-
-    def _check_alive(self, rgb: NDArray[np.uint8]) -> None:
-        """Raises `RobotError` for an image that repeats the last one: noise makes any two images differ."""
-        frozen = self._last_pixels is not None and np.array_equal(self._last_pixels, rgb) and rgb.std() > 0
-        self._last_pixels = rgb
-        if frozen:
-            raise RobotError(f"{self.name} repeats the same image: it is frozen; unplug it and connect it again")
 
 
 def sdk() -> Any:

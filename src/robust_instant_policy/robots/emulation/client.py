@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import select
 import subprocess
 import sys
 import tempfile
@@ -24,6 +25,7 @@ from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cell import CellConfig, DeviceConfig
 
 TIMEOUT_S = 30.0  # of a request; a scene is rendered within seconds
+STARTING_S = 300.0  # of the process; a simulator takes some ten
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,10 @@ class Emulation:
         """Commands ``(N, A, J + 1)`` that the arms executed."""
         return np.load(io.BytesIO(request(f"{self.url}/commands.npy")), allow_pickle=False)
 
+    def times(self) -> FloatArray:
+        """When they executed them, ``(N,)`` seconds of the machine's clock that does not jump."""
+        return np.load(io.BytesIO(request(f"{self.url}/times.npy")), allow_pickle=False)
+
     def failure(self) -> str:
         """Reason why the task is not done, empty if it is."""
         return str(json.loads(request(f"{self.url}/state"))["failure"])
@@ -56,9 +62,9 @@ class Emulation:
         """Build the scene with a ``seed``; the arms are at home, as if parked."""
         request(f"{self.url}/scene/{seed}", b"")
 
-    def fault(self, arm: str, fault: str) -> None:
-        """Give an arm a fault of `faults.FAULTS`, or none with an empty name."""
-        request(f"{self.url}/fault/{arm}/{fault}", b"")
+    def fault(self, arm: str, fault: str) -> float:
+        """Give an arm a fault of `faults.FAULTS`, or none with an empty name; returns when, on the clock of `times`."""
+        return float(request(f"{self.url}/fault/{arm}/{fault}", b""))
 
 
 @contextmanager
@@ -86,11 +92,15 @@ def emulated(config: CellConfig) -> Iterator[Emulation]:
     ):
         assert process.stdin is not None
         assert process.stdout is not None
+        if not select.select([process.stdout], [], [], STARTING_S)[0]:
+            process.kill()
+            raise RobotError(f"the emulated cell did not start within {STARTING_S:g} s; is this computer too busy?")
         line = process.stdout.readline()
         if not line:
             errors.seek(0)
             words = errors.read().decode(errors="replace").strip().splitlines()
-            raise RobotError(f"the emulated cell does not start: {words[-1] if words else 'it ended at once'}")
+            reason = words[-1].removeprefix("rip: ") if words else "it ended at once"
+            raise RobotError(f"the emulated cell does not start: {reason}")
         started = json.loads(line)
         arms = tuple(
             replace(arm, driver=replace(arm.driver, options=MappingProxyType(started["devices"][arm.name])))

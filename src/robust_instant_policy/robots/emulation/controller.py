@@ -55,14 +55,16 @@ READY, DONE = 1, 2
 RUNNING, STOPPED = 2, 1  # runtime states
 NORMAL_BIT, PROTECTIVE_BIT = 0x01, 0x04  # of the safety status
 POWER_BIT, PROGRAM_BIT = 0x01, 0x02  # of the robot status
-SLACK = 10  # factor of the watchdog's time: the emulation shares the processor with what uses it
+# The emulation shares the processor with what uses it: times are longer than a controller's.
+SLACK = 20  # factor of the watchdog's time
+TIMEOUT_S, LATENCY_S = 0.9, 0.1  # of the gripper's answers; of states
 
 
 class Controller:
     """Serves arm ``index`` of ``twin``. See `server.Device`."""
 
-    def __init__(self, twin: SharedTwin, index: int, finger_travel: float):
-        self._twin, self._index, self._travel = twin, index, finger_travel
+    def __init__(self, twin: SharedTwin, index: int, finger_travel: float, pace: float):
+        self._twin, self._index, self._travel, self._pace = twin, index, finger_travel, pace
         self.fault, self.limp = FaultSwitch(), False
         self._address = f"127.{64 + secrets.randbelow(128)}.{secrets.randbelow(256)}.{1 + secrets.randbelow(254)}"
         self._lock, self._start = threading.Lock(), time.monotonic()
@@ -81,14 +83,18 @@ class Controller:
 
     @property
     def options(self) -> dict[str, str | float]:
-        return {"address": self._address}
+        return {"address": self._address, "timeout_s": TIMEOUT_S, "latency_s": min(self._pace * LATENCY_S, 1.0)}
 
     def unplug(self) -> None:
         """Pull the network cable: all connections end, and none can be made."""
         self.fault.set("unplugged")
+        self._cut()
         for server in self._servers:
             server.shutdown()
             server.server_close()
+        self._cut()  # what was made meanwhile
+
+    def _cut(self) -> None:
         for connection in list(self._connections):
             with contextlib.suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)

@@ -1,7 +1,7 @@
 """The process of an emulated cell: its devices, and an HTTP address for its camera, its faults and its task.
 
-``GET /observation.npz``, ``/commands.npy`` (what the arms executed), ``/state`` (JSON); ``POST /fault/ARM/FAULT``,
-``/scene/SEED``.
+``GET /observation.npz``, ``/commands.npy`` (what the arms executed), ``/times.npy`` (when), ``/state`` (JSON);
+``POST /fault/ARM/FAULT``, ``/scene/SEED``.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import json
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -39,11 +40,11 @@ class Device(Protocol):
     def unplug(self) -> None: ...
 
 
-def make_device(kind: str, twin: SharedTwin, index: int, finger_travel: float) -> Device:
+def make_device(kind: str, twin: SharedTwin, index: int, finger_travel: float, pace: float) -> Device:
     if kind == "viperx":
         return ServoBus(twin, index, finger_travel)
     if kind == "ur5e":
-        return Controller(twin, index, finger_travel)
+        return Controller(twin, index, finger_travel, pace)
     raise CellError(f"an arm with the driver {kind!r} cannot be emulated")
 
 
@@ -52,7 +53,9 @@ def serve(config: CellConfig, twin: Twin) -> None:
     take_real_time(DEVICE)
     shared = SharedTwin(twin)
     devices = {
-        one.name: make_device(one.driver.kind, shared, index, arm_of(one, config.path.parent).finger_travel)
+        one.name: make_device(
+            one.driver.kind, shared, index, arm_of(one, config.path.parent).finger_travel, config.pace
+        )
         for index, one in enumerate(config.arms)
     }
     server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(shared, devices))
@@ -79,9 +82,9 @@ def _handler(shared: SharedTwin, devices: Mapping[str, Device]) -> type[BaseHTTP
                         file = Path(folder) / "observation.npz"
                         shared.photograph().save(file)
                         self._send(200, file.read_bytes())
-                elif self.path == "/commands.npy":
+                elif self.path in ("/commands.npy", "/times.npy"):
                     buffer = io.BytesIO()
-                    np.save(buffer, shared.commands)
+                    np.save(buffer, shared.commands if self.path == "/commands.npy" else shared.times)
                     self._send(200, buffer.getvalue())
                 elif self.path == "/state":
                     limp = [name for name, device in devices.items() if device.limp]
@@ -96,6 +99,7 @@ def _handler(shared: SharedTwin, devices: Mapping[str, Device]) -> type[BaseHTTP
             if (what != "fault" or name not in devices) and (what != "scene" or not name.isdecimal()):
                 self._send(404, b"not here")
                 return
+            began = time.monotonic()
             try:
                 if what == "scene":
                     shared.reset(int(name))
@@ -103,7 +107,7 @@ def _handler(shared: SharedTwin, devices: Mapping[str, Device]) -> type[BaseHTTP
                     devices[name].unplug()
                 else:
                     devices[name].fault.set(fault)
-                self._send(200, b"")
+                self._send(200, str(began).encode())
             except RipError as error:
                 self._send(409, str(error).encode())
 

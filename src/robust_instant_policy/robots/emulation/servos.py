@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import pty
+import select
 import threading
 import time
 import tty
@@ -33,8 +34,8 @@ PING, READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x0
 BROADCAST = 0xFE
 RANGE_ERROR, ACCESS_ERROR = 0x04, 0x07
 LOCKED_BELOW = 64  # registers of the EEPROM, which cannot be written with the torque on
-# The emulation shares the processor with what uses it: timeouts are ten times those of real servos.
-EMULATED_TIMEOUT_MS, WATCHDOG_UNIT_S = 300.0, 0.20
+# The emulation shares the processor with what uses it: timeouts are twenty times those of real servos.
+EMULATED_TIMEOUT_MS, WATCHDOG_UNIT_S = 600.0, 0.40
 WATCHDOG_EXPIRED = 0xFF
 OVERLOAD = 0x20
 
@@ -61,7 +62,9 @@ class ServoBus:
             self._put(servo, dxl.VOLTAGE, 120)
             self._put(servo, dxl.TEMPERATURE, 35)
         self._measure()
-        threading.Thread(target=self._serve, daemon=True).start()
+        self._woken, self._wake = os.pipe()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
 
     @property
     def options(self) -> dict[str, str | float]:
@@ -70,17 +73,15 @@ class ServoBus:
     def unplug(self) -> None:
         """Pull the cable: the port is gone."""
         self.fault.set("unplugged")
-        with contextlib.suppress(OSError):
-            os.close(self._slave)
-            os.close(self._master)
+        if self._thread.is_alive():
+            os.write(self._wake, b"!")
+            self._thread.join(1.0)
 
     def _serve(self) -> None:
+        """Answer until the bus is unplugged. The files are closed here: another one may get their numbers at once."""
         buffer = b""
-        while True:
-            try:
-                buffer += os.read(self._master, 4096)
-            except OSError:  # unplugged
-                return
+        while self._woken not in select.select([self._master, self._woken], [], [])[0]:
+            buffer += os.read(self._master, 4096)
             while True:
                 start = buffer.find(b"\xff\xff\xfd\x00")
                 if start < 0 or len(buffer) < start + 7:
@@ -93,6 +94,8 @@ class ServoBus:
                 if self._crc(0, list(packet), len(packet) - 2) == int.from_bytes(packet[-2:], "little"):
                     with contextlib.suppress(OSError):
                         self._answer(packet[4], packet[7], packet[8:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"))
+        for file in (self._slave, self._master, self._woken, self._wake):
+            os.close(file)
 
     def _answer(self, target: int, instruction: int, data: bytes) -> None:
         if self.fault("silent"):

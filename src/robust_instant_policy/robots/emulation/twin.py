@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -76,7 +77,8 @@ class SharedTwin:
     """A twin that the devices of several arms drive, each from its own thread.
 
     The twin advances when every arm was told a command since its last step, or one arm was told a second one: time
-    passes as fast as commands come. ``commands`` keeps what was executed, ``(N, A, J + 1)``.
+    passes as fast as commands come. ``commands`` keeps what was executed, ``(N, A, J + 1)``, ``times`` when, ``(N,)``
+    seconds of the machine's clock that does not jump.
     """
 
     def __init__(self, twin: Twin):
@@ -85,6 +87,7 @@ class SharedTwin:
         self._told = [Command(state.joints, state.finger_travel) for state in states]
         self._waiting: set[int] = set()
         self._executed: list[FloatArray] = []
+        self._times: list[float] = []
 
     def command(self, arm: int, command: Command) -> None:
         with self._lock:
@@ -118,8 +121,14 @@ class SharedTwin:
         with self._lock:
             return np.array(self._executed)
 
+    @property
+    def times(self) -> FloatArray:
+        with self._lock:
+            return np.array(self._times)
+
     def _advance(self) -> None:
         self.twin.advance(self._told)
         self._executed.append(np.stack([np.append(one.joints, one.finger_travel) for one in self._told]))
-        del self._executed[:-KEPT_COMMANDS]
+        self._times.append(time.monotonic())
+        del self._executed[:-KEPT_COMMANDS], self._times[:-KEPT_COMMANDS]
         self._waiting.clear()

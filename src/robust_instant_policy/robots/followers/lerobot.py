@@ -41,6 +41,8 @@ def make(arm: Arm, section: Section, rate_hz: float) -> LeRobotFollower:
     signs, offsets = (
         section.array(key, (count,), [value] * count) for key, value in (("signs", 1.0), ("offsets", 0.0))
     )
+    if not np.isin(signs, (-1.0, 1.0)).all():
+        raise section.error("signs", "must be 1 or -1 for each joint")
     return LeRobotFollower(
         arm.name, device, keys, section.text("gripper", "gripper.pos"), signs, offsets, arm.finger_travel
     )

@@ -7,6 +7,7 @@ script when no target arrives for 100 ms; its safety system stays in charge at a
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import socket
 import sys
 import threading
@@ -19,6 +20,7 @@ from robust_instant_policy.errors import MissingExtraError, RobotError
 from robust_instant_policy.motion.arm import Arm
 from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.cell import Section
+from robust_instant_policy.robots.priority import CONTROL, real_time
 
 try:
     import dashboard_client
@@ -35,9 +37,9 @@ LOOKAHEAD_S, GAIN = 0.1, 300.0  # of servoJ, the maker's defaults
 STOP_DECELERATION = 2.0  # rad/s², of stopJ
 SCRIPT_SECONDS = 5.0  # for the script to start
 STOP_SECONDS, DISCONNECT_SECONDS = 0.5, 2.0  # that the library may take
+LATENCY_S = 0.1  # of a state: servoJ looks ahead, and both ways of RTDE have a period
 GRIPPER_PORT, GRIPPER_TIMEOUT_S = 63352, 0.09
 GRIPPER_FORCE = 100  # of 255
-RUNNING_MODE = 7
 VARIABLES = [
     "timestamp",
     "actual_q",
@@ -58,24 +60,33 @@ SAFETY_BITS = {
 
 
 def make(arm: Arm, section: Section, rate_hz: float) -> UR:
-    """Options: ``address`` of the controller; ``gripper_force``, 0 to 255."""
-    return UR(arm, section.text("address"), section.whole("gripper_force", GRIPPER_FORCE), rate_hz)
+    """Options: ``address`` of the controller; ``gripper_force``, 0 to 255; ``timeout_s`` of the gripper; ``latency_s``
+    by which states may trail commands."""
+    address = section.text("address")
+    gripper = RobotiqGripper(
+        address,
+        arm.finger_travel,
+        section.whole("gripper_force", GRIPPER_FORCE),
+        section.number("timeout_s", GRIPPER_TIMEOUT_S, 0.01, 10.0),
+    )
+    return UR(arm.name, address, gripper, rate_hz, section.number("latency_s", LATENCY_S, 0.0, 1.0))
 
 
 class UR:
     """See `robots.follower.Follower`."""
 
-    def __init__(self, arm: Arm, address: str, gripper_force: int, rate_hz: float):
-        self.name, self._address, self._step = arm.name, address, 1 / rate_hz
-        self._gripper = RobotiqGripper(address, arm.finger_travel, gripper_force)
+    def __init__(self, name: str, address: str, gripper: RobotiqGripper, rate_hz: float, latency_s: float):
+        self.name, self._address, self._step, self._latency_s = name, address, 1 / rate_hz, latency_s
+        self._gripper = gripper
         self._receive = self._control = None
         self._serving = False
 
     def connect(self) -> None:
         try:
             self._check_dashboard()
-            self._receive = rtde_receive.RTDEReceiveInterface(self._address, RECEIVE_HZ, VARIABLES)
-            self._control = rtde_control.RTDEControlInterface(self._address, RECEIVE_HZ)
+            with real_time(CONTROL):  # the library's threads, which would be late on a busy computer, inherit it
+                self._receive = rtde_receive.RTDEReceiveInterface(self._address, RECEIVE_HZ, VARIABLES)
+                self._control = rtde_control.RTDEControlInterface(self._address, RECEIVE_HZ)
             self._gripper.connect()
         except RobotError:
             self.disconnect()
@@ -106,6 +117,7 @@ class UR:
             grip_load=load,
             clock=receive.getTimestamp(),
             faults=_faults(bits),
+            latency_s=self._latency_s,
         )
 
     def _command(self, control: rtde_control.RTDEControlInterface, command: Command) -> None:
@@ -126,14 +138,15 @@ class UR:
         # and the watchdog stops the script.
         control = self._control
         for call in (control.servoStop, lambda: control.stopJ(STOP_DECELERATION), control.stopScript):
-            if not _bounded(call, STOP_SECONDS):
+            if _bounded(call, STOP_SECONDS) is None:
                 return
 
     def disconnect(self) -> None:
         self.stop()
         for interface in (self._control, self._receive):
-            if interface is not None:
-                _bounded(interface.disconnect, DISCONNECT_SECONDS)
+            if interface is not None and not _bounded(interface.disconnect, DISCONNECT_SECONDS):
+                # The destructor would do the same again, and end the whole process where the connection was lost.
+                ctypes.pythonapi.Py_IncRef(ctypes.py_object(interface))
         self._control = self._receive = None
         self._gripper.disconnect()
 
@@ -186,34 +199,37 @@ def _faults(bits: int) -> tuple[str, ...]:
     return tuple(words for bit, words in SAFETY_BITS.items() if bits >> bit & 1)
 
 
-def _bounded(call: Callable[[], object], seconds: float) -> bool:
-    """Whether ``call`` came back in time; the library may wait for minutes on a connection that is dead."""
+def _bounded(call: Callable[[], object], seconds: float) -> bool | None:
+    """Whether ``call`` succeeded, None if it did not come back in time: the library may wait for minutes on a
+    connection that is dead."""
+    succeeded = []
 
     def run() -> None:
         with contextlib.suppress(RuntimeError):
             call()
+            succeeded.append(True)
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     thread.join(seconds)
-    return not thread.is_alive()
+    return None if thread.is_alive() else bool(succeeded)
 
 
 class RobotiqGripper:
     """A Robotiq gripper behind the UR's controller: text lines on port 63352 (Robotiq's URCap).
 
-    Positions are 0 (open) to 255 (closed). Raises `RobotError` when it does not answer within 90 ms.
+    Positions are 0 (open) to 255 (closed). Raises `RobotError` when it does not answer within ``timeout_s``.
     """
 
-    def __init__(self, address: str, travel: float, force: int):
-        self._address, self._travel, self._force = address, travel, force
+    def __init__(self, address: str, travel: float, force: int, timeout_s: float):
+        self._address, self._travel, self._force, self._timeout_s = address, travel, force, timeout_s
         self._socket: socket.socket | None = None
         self._told = -1
 
     def connect(self) -> None:
         try:
             self._socket = socket.create_connection((self._address, GRIPPER_PORT), timeout=1.0)
-            self._socket.settimeout(GRIPPER_TIMEOUT_S)
+            self._socket.settimeout(self._timeout_s)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except OSError:
             raise RobotError(
@@ -224,7 +240,11 @@ class RobotiqGripper:
 
     def read(self) -> tuple[float, float]:
         """Travel of each finger in metres, and 1 where the fingers stopped at something, else 0."""
-        position, stopped, fault = (int(line.split()[1]) for line in self._ask("GET POS", "GET OBJ", "GET FLT"))
+        answers = self._ask("GET POS", "GET OBJ", "GET FLT")
+        try:
+            position, stopped, fault = (int(line.split()[1]) for line in answers)
+        except (IndexError, ValueError):
+            raise RobotError(f"the gripper at {self._address} answers {answers}, not three numbers") from None
         if fault:
             raise RobotError(f"the gripper reports fault {fault}; see its manual, and activate it again")
         return (1 - position / 255) * self._travel, float(stopped in (1, 2))

@@ -163,8 +163,10 @@ class ViperX:
         for servo in ALL:
             bus.write(servo, dxl.PROFILE_VELOCITY, 0)  # the commands themselves are smooth
             bus.write(servo, dxl.PROFILE_ACCELERATION, 0)
-        positions = bus.sync_read(ALL, dxl.PRESENT_POSITION)[:, 0]
-        bus.sync_write(ALL, dxl.GOAL_POSITION, positions.tolist())
+        # A gripper that holds something presses towards its goal: the present position would end its force.
+        servos = JOINTS if bus.read(GRIPPER, dxl.TORQUE) else ALL
+        positions = bus.sync_read(servos, dxl.PRESENT_POSITION)[:, 0]
+        bus.sync_write(servos, dxl.GOAL_POSITION, positions.tolist())
         for servo in SERVOS:
             bus.write(servo, dxl.TORQUE, 1)
 

@@ -41,6 +41,12 @@ class ArmLeader:
 
     def connect(self) -> None:
         self._source.connect()
+        count, most = len(self._source.angles()), max(*self._map.channels.tolist(), self._map.gripper_channel)
+        if most >= count:
+            raise RobotError(
+                f"{self.name} has {count} channels, 0 to {count - 1}; its calibration reads channel {most}: run "
+                "rip calibrate leader"
+            )
 
     def start(self) -> None:
         self._last = None

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm
-from robust_instant_policy.motion.state import ArmState, Command
+from robust_instant_policy.motion.state import ArmState, Command, is_gripping
 
 LEAD_M, LEAD_RAD = 0.03, 0.3  # by which the wanted tool pose may be ahead of the measured one
 REACHED_M = 0.003  # a pose that the arm misses by more is not commanded
@@ -46,7 +46,7 @@ class JogLeader:
 
     def read(self, follower: ArmState) -> Command:
         arm = self._arm
-        told = self._told or Command(follower.joints, arm.finger_travel)
+        told = self._told or Command(follower.joints, self._first_travel(follower))
         motion, toggled = self._source.step()
         travel = told.finger_travel if not toggled else arm.finger_travel - told.finger_travel
         pose = arm.kinematics.tool_pose(told.joints)
@@ -62,6 +62,11 @@ class JogLeader:
                 joints = path.joints[0]
         self._told = Command(joints, travel)
         return self._told
+
+    def _first_travel(self, follower: ArmState) -> float:
+        """A closed gripper, or one that holds something, stays closed until it is told to open."""
+        full = self._arm.finger_travel
+        return full if follower.finger_travel > full / 2 and not is_gripping(follower, full) else 0.0
 
     def disconnect(self) -> None:
         self._source.disconnect()

@@ -65,7 +65,7 @@ class JointMap:
         """Raises `CellError` that names a missing or wrong key."""
         section = read_section(path)
         channels = section.array("channels", (None,)).astype(np.intp)
-        return cls(
+        joints = cls(
             channels,
             section.array("signs", (len(channels),)),
             section.array("offsets", (len(channels),)),
@@ -73,6 +73,14 @@ class JointMap:
             section.number("gripper_open"),
             section.number("gripper_closed"),
         )
+        used = [*channels.tolist(), joints.gripper_channel]
+        if min(used) < 0 or len(set(used)) < len(used):
+            raise section.error("channels", "must be different numbers from 0, and none of them gripper_channel")
+        if not np.isin(joints.signs, (-1.0, 1.0)).all():
+            raise section.error("signs", "must be 1 or -1 for each joint")
+        if joints.gripper_open == joints.gripper_closed:
+            raise section.error("gripper_open", "must not be gripper_closed")
+        return joints
 
 
 def calibrate_joints(joints: FloatArray, readings: FloatArray, opened: FloatArray, closed: FloatArray) -> JointMap:
