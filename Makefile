@@ -36,7 +36,7 @@ test: setup
 LEROBOT := .venv-lerobot
 lerobot: setup
 	plugins/setup.sh $(LEROBOT)
-	MUJOCO_GL=egl $(LEROBOT)/bin/python -m pytest -p no:cacheprovider tests/test_lerobot_plugin.py
+	MUJOCO_GL=egl $(LEROBOT)/bin/python -m pytest -p no:cacheprovider tests/test_lerobot_plugin.py tests/test_robots_lerobot.py
 	.venv/bin/python scripts/lerobot_end_to_end.py --lerobot $(LEROBOT)
 
 clean:

@@ -32,7 +32,7 @@ import numpy as np
 from robust_instant_policy.errors import RipError
 from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.motion.arm import Arm, Motion
-from robust_instant_policy.motion.guard import Space, check_joint_range, plan_guarded
+from robust_instant_policy.motion.guard import ROUNDING_M, Space, check_joint_range, plan_guarded
 from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cell import CellConfig, DeviceConfig
 from robust_instant_policy.robots.emulation.client import Emulation, emulated
@@ -96,12 +96,12 @@ class Bench:
         if self._emulation is None:
             self._context = emulated(self._config)
             self._emulation = self._context.__enter__()
-            if self._real_time:
-                self._emulation = replace(self._emulation, config=in_real_time(self._emulation.config))
         self._emulation.fault(self.name, "")
         with Station(self._emulation.config) as station:
             if not is_parked(station) and (stopped := park(station, StopRequest(), 1.0).stopped):
                 raise SystemExit(f"the emulated arm could not be parked for the next case: {stopped}; run again")
+        if self._real_time:
+            return replace(self._emulation, config=in_real_time(self._emulation.config))
         return self._emulation
 
     def close(self) -> None:
@@ -163,6 +163,8 @@ def during_motion(fault: str) -> Callable[[Case], Outcome]:
             motion = case.motion(station)
             with _at(emulation, begun + case.moment(motion), fail):
                 played = station.play(motion, StopRequest())
+        if math.isinf(since[0]):
+            raise SystemExit(f"stopped before the fault, this computer is too busy: {played.stopped}; run again")
         return replace(_judged(case, emulation, begun, played), late=max(emulation.times()[-1] - since[0], 0.0))
 
     return inject
@@ -360,7 +362,9 @@ def outside_limits(executed: FloatArray, arm: Arm, config: CellConfig) -> str:
         if not np.isfinite(executed).all():
             return "not a number"
         check_joint_range(joints[:, 0], arm, config.rate_hz)
-        Space([arm], config.limits).check(joints, config.rate_hz)
+        space = Space([arm], config.limits)
+        on_its_way_in = (space.outside(joints) > ROUNDING_M).all()  # from the park pose, when it was stopped
+        space.check(joints, config.rate_hz, to_home=on_its_way_in)
     except RipError as error:
         return str(error)
     steps = np.abs(np.diff(joints[:, 0], axis=0)).max(axis=1)

@@ -38,13 +38,19 @@ REST_MS = 2000  # between presses, for the arm to come to rest in the picture
 CHANGED, CHANGED_PIXELS = 40, 30  # difference of a colour, and number of pixels, from which the arm has moved
 PATIENCE_MS = 300_000
 TASKS_IN_TURN = 10
+FIRST_TASK = "push-cube"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--minutes", type=float, default=30.0, help="of use, for the memory")
     options = parser.parse_args()
-    rows: list[tuple[str, str]] = []
+    rows: list[tuple[str, str, float]] = []
+
+    def measured(name: str, value: str) -> None:
+        rows.append((name, value, os.getloadavg()[0]))
+        write(rows)
+
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as api:
         start = time.monotonic()
         command = [
@@ -57,55 +63,51 @@ def main() -> None:
             "--demos",
             f"{folder}/demos",
         ]
-        server = subprocess.Popen([*command, "--task", "push-cube"], stdout=subprocess.PIPE, text=True)
+        server = subprocess.Popen([*command, "--task", FIRST_TASK], stdout=subprocess.PIPE, text=True)
         try:
             assert server.stdout is not None
             address = re.search(r"http://\S+", server.stdout.readline())
             assert address is not None, "the studio printed no address"
-            rows.append(("address printed after", f"{time.monotonic() - start:.1f} s"))
+            measured("address printed after", f"{time.monotonic() - start:.1f} s")
             chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
             browser = api.chromium.launch(executable_path=chromium, args=SOFTWARE)
             page = browser.new_page(viewport={"width": 1200, "height": 760})
             page.goto(address[0], timeout=PATIENCE_MS)
             wait(page, "Your turn")
-            rows.append(("scene ready in the browser after", f"{time.monotonic() - start:.1f} s"))
+            process = psutil.Process(server.pid)
+            spent = sum(process.cpu_times()[:2])
+            measured("scene ready in the browser after", f"{time.monotonic() - start:.1f} s")
+            measured("processor time of the server until then", f"{spent:.1f} s")
             delays = latencies(page)
             quarter, median, most = np.percentile(delays, [25, 50, 90])
-            rows.append(
-                (f"key to motion in the picture, {len(delays)} presses: median (quartile, 90%)",
-                 f"{median:.0f} ms ({quarter:.0f}, {most:.0f})")
-            )  # fmt: skip
-            write(rows)
-            process = psutil.Process(server.pid)
+            measured(
+                f"key to motion in the picture, {len(delays)} presses: median (quartile, 90%)",
+                f"{median:.0f} ms ({quarter:.0f}, {most:.0f})",
+            )
             before = process.memory_info().rss
             scenes = use(page, 60 * options.minutes)
             grown = (process.memory_info().rss - before) / 1e6
-            rows.append(
-                (
-                    f"memory after {options.minutes:g} minutes of use, {scenes} scenes",
-                    f"{grown:+.0f} MB of {before / 1e6:.0f}",
-                )
+            measured(
+                f"memory after {options.minutes:g} minutes of use, {scenes} scenes",
+                f"{grown:+.0f} MB of {before / 1e6:.0f}",
             )
-            write(rows)
             seconds = tasks_in_turn(page)
-            rows.append(
-                (
-                    f"{len(seconds)} tasks opened one after the other, seconds each",
-                    f"{min(seconds):.1f} to {max(seconds):.1f}",
-                )
+            measured(
+                f"{len(seconds)} tasks opened one after the other, seconds each",
+                f"{min(seconds):.1f} to {max(seconds):.1f}",
             )
-            rows.append(("memory after that", f"{process.memory_info().rss / 1e6:.0f} MB"))
-            write(rows)
+            measured("memory after that", f"{process.memory_info().rss / 1e6:.0f} MB")
             browser.close()
         finally:
             server.send_signal(signal.SIGTERM)
             server.wait(30)
 
 
-def write(rows: list[tuple[str, str]]) -> None:
-    """Write the table of what was measured so far."""
-    head = f"| quantity ({os.cpu_count()} cores, load average {os.getloadavg()[1]:.1f} with other work) | measured |"
-    TABLE.write_text("\n".join([head, "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows)]) + "\n")
+def write(rows: list[tuple[str, str, float]]) -> None:
+    """Write the table of what was measured so far, with the load average of the minute before."""
+    head = f"| quantity | measured | load average, {os.cpu_count()} cores |"
+    lines = (f"| {name} | {value} | {load:.1f} |" for name, value, load in rows)
+    TABLE.write_text("\n".join([head, "| --- | --- | --- |", *lines]) + "\n")
     print(TABLE.read_text(), flush=True)
 
 
@@ -157,7 +159,9 @@ def use(page: Page, seconds: float) -> int:
             page.wait_for_timeout(30)
         page.keyboard.press("z")
         page.wait_for_timeout(500)
-        page.get_by_text("Another scene").click()
+        page.keyboard.press("x")
+        wait(page, "Your turn")
+        page.get_by_role("button", name="Another scene").click()
         wait(page, "Your turn")
         scenes += 1
     return scenes
@@ -166,7 +170,8 @@ def use(page: Page, seconds: float) -> int:
 def tasks_in_turn(page: Page) -> list[float]:
     """Seconds to open each of ten tasks."""
     seconds = []
-    for name in (*TASK_NAMES[1:TASKS_IN_TURN], TASK_NAMES[0]):
+    others = [name for name in TASK_NAMES if name != FIRST_TASK]
+    for name in (*others[: TASKS_IN_TURN - 1], FIRST_TASK):
         start, before = time.monotonic(), page.inner_text("#studio-banner")
         tasks = page.locator("input.mantine-Select-input:visible").first
         tasks.fill(name)

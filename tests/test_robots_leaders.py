@@ -163,21 +163,6 @@ class Teleoperator:
         """Nothing to close."""
 
 
-def test_a_lerobot_teleoperator_leads_by_its_degrees(cell):
-    closed, opened = np.radians([0.0, 100.0])
-    JointMap(np.arange(6), np.ones(6), np.zeros(6), 6, opened, closed).save(cell.file.parent / "so101.toml")
-    table = {"factory": f"{__name__}:Teleoperator", "calibration": "so101.toml"}
-    leader = leader_of(cell, kind="lerobot", keys=" ".join(f"{name}.pos" for name in Teleoperator.names), **table)
-    leader.connect()
-    leader.start()
-    command = leader.read(follower())
-    np.testing.assert_allclose(command.joints, PARK, atol=1e-4)
-    assert command.finger_travel == pytest.approx(TRAVEL / 2)
-    wrong = leader_of(cell, kind="lerobot", keys="shoulder.pos " * 7, **table)
-    with pytest.raises(RobotError, match=r"has no shoulder\.pos.*it has elbow\.pos"):
-        wrong.read(follower())
-
-
 def test_keys_move_the_tool_along_the_worlds_axes_and_never_run_away(cell):
     typed = ["", "ii ", "", "k" * 100]
     leader = leader_of(cell, kind="keyboard", pressed=lambda keys: typed.pop(0) if typed else "i")

@@ -1,20 +1,28 @@
-"""LeRobot's robots: a class of the shape of its ``Robot`` follows plans through the adapter."""
+"""LeRobot's robots and teleoperators: classes of our own follow and lead through the adapters.
+
+Where LeRobot is installed (`make lerobot`), they derive from its ``Robot`` and ``Teleoperator``, else have that shape.
+"""
 
 from __future__ import annotations
 
 import sys
-from types import SimpleNamespace
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from robust_instant_policy.errors import CellError
+from robust_instant_policy.errors import CellError, RobotError
 from robust_instant_policy.motion.guard import plan_guarded
 from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.leaders import JointMap, make_leader
 from robust_instant_policy.robots.signals import StopRequest
 from robust_instant_policy.robots.station import Station
 from robust_instant_policy.trajectory import Trajectory
 
+KEYS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 SIGNS, OFFSETS = (1, -1, 1, 1, 1), (0, 10, 0, 0, 0)
 PARK = (0.9, -0.6, 1.2, 0.9, 0.0)
@@ -43,17 +51,51 @@ def urdf() -> str:
     return text
 
 
-class Desk:
+try:
+    from lerobot.robots import Robot, RobotConfig
+    from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
+
+    @dataclass
+    class DeskConfig(RobotConfig):
+        disable_torque_on_disconnect: bool = True
+
+except ImportError:  # it needs an environment of its own
+    DeskConfig = TeleoperatorConfig = SimpleNamespace
+
+    class Robot:
+        def __init__(self, config: Any): ...
+
+    Teleoperator = Robot
+
+
+class Device:
+    """What LeRobot asks of a device, beyond its data."""
+
+    is_connected = is_calibrated = True
+    action_features = observation_features = feedback_features = MappingProxyType(dict.fromkeys(KEYS, float))
+
+    def connect(self, calibrate: bool = True) -> None: ...
+    def calibrate(self) -> None: ...
+    def configure(self) -> None: ...
+    def send_feedback(self, feedback: dict) -> None: ...
+    def disconnect(self) -> None: ...
+
+
+class Desk(Device, Robot):
     """Follows its actions at once, in degrees and percent, as LeRobot's robots do."""
 
-    def __init__(self) -> None:
-        self.config = SimpleNamespace(disable_torque_on_disconnect=True)
+    name, config_class = "desk", DeskConfig
+
+    def __init__(self, folder: Path) -> None:
+        self.config = DeskConfig(id="desk", calibration_dir=folder)
+        self.config.disable_torque_on_disconnect = True
+        super().__init__(self.config)
         degrees = np.array(SIGNS) * np.rad2deg(PARK) + OFFSETS
         self.values = {f"{name}.pos": float(value) for name, value in zip(JOINTS, degrees, strict=True)}
         self.values["gripper.pos"] = 100.0
         self.broken = False
 
-    def connect(self) -> None:
+    def connect(self, calibrate: bool = True) -> None:
         assert not self.config.disable_torque_on_disconnect  # it would fall at the end
 
     def get_observation(self) -> dict:
@@ -65,21 +107,33 @@ class Desk:
         self.values.update(action)
         return action
 
-    def disconnect(self) -> None: ...
+
+class Leading(Device, Teleoperator):
+    """A leader arm at the desk's park pose, turned by 0.2 rad, its trigger half closed."""
+
+    name, config_class = "leading", TeleoperatorConfig
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(TeleoperatorConfig(id="leading", calibration_dir=folder))
+
+    def get_action(self) -> dict:
+        values = [*np.rad2deg(np.subtract(PARK, [0.2, 0, 0, 0, 0])), 50.0]
+        return {f"{name}.pos": float(value) for name, value in zip(KEYS, values, strict=True)}
 
 
-TWO = """[[arms]]
+TWO = f"""[[arms]]
 name = "left"
-model = "viperx-300"
-park = [-1.4, -0.43, 0.434, 0, 1.567, 0]
-driver = { kind = "viperx", port = "/dev/null" }
+model = "desk.urdf"
+park = {list(PARK[:4])}
+gripper = "gripper.toml"
+driver = {{ kind = "lerobot", factory = "my_robot:make", keys = "{" ".join(f"{name}.pos" for name in JOINTS[:4])}" }}
 [[arms]]"""
 
 
 @pytest.fixture
 def cell(tmp_path, monkeypatch):
-    module = SimpleNamespace(desk=Desk())
-    module.make = lambda: module.desk
+    module = SimpleNamespace(desk=Desk(tmp_path))
+    module.make, module.leading = lambda: module.desk, lambda: Leading(tmp_path)
     monkeypatch.setitem(sys.modules, "my_robot", module)
     (tmp_path / "desk.urdf").write_text(urdf())
     (tmp_path / "gripper.toml").write_text("length = 0.06\nopening = 0.05\n")
@@ -112,6 +166,27 @@ def test_a_plan_arrives_in_the_robots_own_units_and_its_torque_stays_on(cell):
     sent = np.array([desk.values[f"{name}.pos"] for name in JOINTS])
     np.testing.assert_allclose(sent, np.array(SIGNS) * np.rad2deg(motion.joints[-1, 0]) + OFFSETS, atol=1e-9)
     assert desk.values["gripper.pos"] == pytest.approx(0.0)
+
+
+def test_a_teleoperator_leads_by_its_degrees_and_the_robot_follows(cell):
+    path, desk = cell
+    JointMap(np.arange(5), np.ones(5), np.zeros(5), 5, np.radians(100.0), 0.0).save(path.parent / "leader.toml")
+    keys = " ".join(f"{name}.pos" for name in KEYS)
+    leader = f"{{ kind = 'lerobot', factory = 'my_robot:leading', keys = '{keys}', calibration = 'leader.toml' }}"
+    path.write_text(path.read_text().replace("driver =", f"leader = {leader}\ndriver ="))
+    config = CellConfig.load(path)
+    with Station(config) as station:
+        device = make_leader(config.arms[0], station.arms[0], 100.0, path.parent, lambda keys: "")
+        device.connect()
+        device.start()
+        steps = iter(range(100))
+        station.lead(lambda states: [device.read(states[0])] if next(steps) < 99 else None)
+        device.disconnect()
+    assert desk.values["shoulder_pan.pos"] == pytest.approx(np.rad2deg(PARK[0] - 0.2))
+    assert desk.values["gripper.pos"] == pytest.approx(50.0)
+    path.write_text(path.read_text().replace(keys, "shoulder.pos " * 6))
+    with pytest.raises(RobotError, match=r"has no shoulder\.pos.*it has elbow_flex\.pos"):
+        make_leader(CellConfig.load(path).arms[0], station.arms[0], 100.0, path.parent, lambda keys: "").connect()
 
 
 def test_a_joint_that_turns_without_end_has_no_range(cell):
@@ -167,7 +242,7 @@ def test_a_robot_that_does_not_answer_stops_the_run_and_is_named(cell):
         ("'desk.urdf'", "'other.urdf'", "no model 'other.urdf'; known: viperx-300"),
         ("'desk.urdf'", "'broken.urdf'", "^[^\\n]*broken.urdf cannot be used: [^\\n]*; it needs a link called tool$"),
         ("signs = [1,", "signs = [0.5,", "signs must be 1 or -1 for each joint"),
-        ("[[arms]]", TWO, "arms of a cell must have as many joints as each other, not left 6, desk 5"),
+        ("[[arms]]", TWO, "arms of a cell must have as many joints as each other, not left 4, desk 5"),
     ],
 )
 def test_a_wrong_line_about_the_robot_is_named(cell, old, new, words):

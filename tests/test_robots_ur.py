@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 
-from robust_instant_policy.errors import RobotError
+from robust_instant_policy.errors import RobotError, StoppedError
 from robust_instant_policy.motion.guard import plan_guarded
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.client import devices_of
@@ -82,6 +82,16 @@ def test_a_fault_stops_the_arm_and_a_later_run_works_again(emulated, fault, word
     assert len(emulation.commands()) <= executed + 1
     with Station(config) as station:
         assert not park(station, StopRequest(), 1.0).stopped
+
+
+def test_an_arm_whose_positions_are_not_numbers_is_not_parked(emulated):
+    config, emulation = emulated
+    with Station(config) as station:
+        emulation.fault("hand-e", "nan")
+        while np.isfinite(station.states()[0].joints).all():
+            pass
+        with pytest.raises(StoppedError, match="hand-e measures positions that are not numbers"):
+            park(station, StopRequest(), 1.0)
 
 
 def test_a_garbled_answer_of_the_gripper_is_told():

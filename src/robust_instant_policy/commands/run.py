@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
 from robust_instant_policy.commands.options import RUNS, add_method, method_settings, positive
 from robust_instant_policy.datasets import load_demonstrations
-from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import StoppedError, UsageError
 from robust_instant_policy.files import make_folder, write_whole
 from robust_instant_policy.llm import connect
@@ -74,9 +77,62 @@ def run(options: argparse.Namespace) -> int:
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out} is a file; a run needs a folder")
     make_folder(out)
-    with devices_of(config) as (config, emulation):
-        _Run(config, emulation, out, options, screen).run()
+    with ExitStack() as stack:
+        config, emulation = stack.enter_context(devices_of(config))
+        planner = None if options.plan else stack.enter_context(_Planner.open(config, options, screen))
+        _Run(config, emulation, planner, out, options, screen).run()
+        for number in count(2):
+            if options.plan or options.dry_run or options.yes or not _goes_on():
+                break
+            if emulation is not None:
+                emulation.scene(number - 1 + config.emulation_section().whole("seed", 0))
+            screen.stages.clear()
+            _Run(config, emulation, planner, out.parent / f"{out.name or RUNS.name}-{number}", options, screen).run()
     return 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Planner:
+    """Plans from demonstrations for one scene after another."""
+
+    config: CellConfig
+    screen: StageConsole
+    demonstrations: Sequence[Demonstration]
+    policy: RobustInstantPolicy
+    llm: str
+
+    @classmethod
+    @contextmanager
+    def open(cls, config: CellConfig, options: argparse.Namespace, screen: StageConsole) -> Iterator[_Planner]:
+        """Load the demonstrations and the language model, which is closed with the context."""
+        demonstrations = load_demonstrations(options.demos)
+        with screen.stage(f"language model ({options.llm})"):
+            model = connect(options.llm)
+        with closing(model):
+            policy = RobustInstantPolicy(
+                model,
+                method_settings(options),
+                num_queries=options.queries,
+                deadline_s=options.deadline,
+                progress=screen.done_so_far,
+                workspace=config.limits.workspace,
+            )
+            with screen.stage("keypoints of the demonstrations"):
+                policy.fit(demonstrations)
+            yield cls(config, screen, demonstrations, policy, model.name)
+
+    def plan(self, seen: Observation, out: Path) -> RunRecord:
+        """Plan for what is ``seen``; image, plan and context lie in the run folder ``out`` then."""
+        with self.screen.stage("plan"):
+            plan = replace(self.policy.plan(seen), cell=self.config.digest)
+        make_folder(out)
+        seen.save(out / SEEN_FILE)
+        plan.save(out / PLAN_FILE)
+        save_context(out, [one.observation.rgb for one in self.demonstrations], self.policy.context_.pixels)
+        for note in plan.notes:
+            self.screen.say(f"    {note}")
+        task = self.demonstrations[0].task or self.config.name
+        return RunRecord(task, task, None, self.llm, self.policy.name, None, PLANNED, tuple(self.screen.stages))
 
 
 class _Run:
@@ -86,11 +142,13 @@ class _Run:
         self,
         config: CellConfig,
         emulation: Emulation | None,
+        planner: _Planner | None,
         out: Path,
         options: argparse.Namespace,
         screen: StageConsole,
     ):
-        self._config, self._emulation, self._out, self._options, self._screen = config, emulation, out, options, screen
+        self._config, self._emulation, self._planner = config, emulation, planner
+        self._out, self._options, self._screen = out, options, screen
         self._done = RUNS / "cells" / f"{config.digest}.ok"  # there once a run with this calibration ended well
         self._speed = options.speed or (1.0 if self._done.exists() else config.first_run_speed)
 
@@ -136,7 +194,10 @@ class _Run:
 
     def _prepare(self, station: Station) -> tuple[Motion, RunRecord]:
         """A checked motion, and what is known of the run; the page shows the plan already."""
-        record = RunRecord.load(self._out) if self._options.plan else self._plan()
+        if self._planner is None:
+            record = RunRecord.load(self._out)
+        else:
+            record = self._planner.plan(self._observation(), self._out)
         record = replace(record, success=None, outcome=PLANNED)
         record.save(self._out)
         (self._out / MEASURED_FILE).unlink(missing_ok=True)  # of an earlier run
@@ -154,36 +215,6 @@ class _Run:
                 self._speed,
             )
         return motion, record
-
-    def _plan(self) -> RunRecord:
-        """Take an image and plan; image, plan and context lie in the run folder then."""
-        demonstrations = load_demonstrations(self._options.demos)
-        seen = self._observation()
-        with self._screen.stage(f"language model ({self._options.llm})"):
-            model = connect(self._options.llm)
-        settings = method_settings(self._options)
-        try:
-            policy = RobustInstantPolicy(
-                model,
-                settings,
-                num_queries=self._options.queries,
-                deadline_s=self._options.deadline,
-                progress=self._screen.done_so_far,
-                workspace=self._config.limits.workspace,
-            )
-            with self._screen.stage("keypoints of the demonstrations"):
-                policy.fit(demonstrations)
-            with self._screen.stage("plan"):
-                plan = replace(policy.plan(seen), cell=self._config.digest)
-        finally:
-            model.close()
-        seen.save(self._out / SEEN_FILE)
-        plan.save(self._out / PLAN_FILE)
-        save_context(self._out, [one.observation.rgb for one in demonstrations], policy.context_.pixels)
-        for note in plan.notes:
-            self._screen.say(f"    {note}")
-        task = demonstrations[0].task or self._config.name
-        return RunRecord(task, task, None, model.name, policy.name, None, PLANNED, tuple(self._screen.stages))
 
     def _observation(self) -> Observation:
         if self._config.camera is None:
@@ -229,6 +260,13 @@ def _agrees(question: str) -> bool:
         return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
     except EOFError:
         raise StoppedError("the terminal was closed; the arms hold") from None
+
+
+def _goes_on() -> bool:
+    try:
+        return _agrees("arrange the next scene; go on?")
+    except StoppedError:  # the terminal was closed
+        return False
 
 
 def _share(text: str) -> float:

@@ -9,9 +9,10 @@ import plotly.graph_objects as go
 from markupsafe import Markup
 from plotly.subplots import make_subplots
 
+from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.policies.policy import Plan
-from robust_instant_policy.reporting.pictures import keypoint_colour, tool_points
+from robust_instant_policy.reporting.pictures import keypoint_colour, scene_points, tool_points
 from robust_instant_policy.robots.path import MeasuredPath
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
@@ -21,6 +22,7 @@ AXIS_LENGTH_M = 0.03
 AXES = (("#d62728", "gripper x"), ("#2ca02c", "gripper y (opening)"), ("#1f77b4", "gripper z (approach)"))
 CAMERA = {"eye": {"x": 1.5, "y": -1.6, "z": 1.2}, "center": {"x": 0, "y": 0, "z": -0.2}}  # shows all of it
 COLUMNS = 3  # of charts side by side
+MAX_POINTS = 8_000  # of the point cloud under the paths
 WEIGHT_COLOURS = "Viridis_r"  # dark: followed, pale: ignored
 ROBUST_COLOUR = "#111111"
 HALLUCINATED_COLOUR = "#d1495b"
@@ -44,9 +46,13 @@ def candidate_colour(plan: Plan, index: int) -> str:
     return HALLUCINATED_COLOUR if plan.hallucinated[index] else CANDIDATE_COLOURS[index % len(CANDIDATE_COLOURS)]
 
 
-def paths_in_space(plan: Plan) -> go.Figure:
-    """Fingertip paths in the world, candidates coloured by weight, with the gripper's axes along the robust one."""
+def paths_in_space(plan: Plan, observation: Observation) -> go.Figure:
+    """Paths between the fingertips in the world, candidates coloured by weight, with the gripper's axes along the
+    robust one and what its fingertips sweep, over the points that the camera saw."""
     figure = go.Figure()
+    points, colours = scene_points(observation, MAX_POINTS)
+    look = {"size": 2, "color": [f"rgb({r},{g},{b})" for r, g, b in colours]}
+    _add_points(figure, points.astype(np.float32), mode="markers", name="camera", marker=look, hoverinfo="skip")
     for index, candidate in enumerate(plan.candidates):
         weight = np.interp(candidate.times, plan.trajectory.times, plan.weights[index])
         shade = {"color": weight, "colorscale": WEIGHT_COLOURS, "cmin": 0, "cmax": 1}
@@ -127,6 +133,9 @@ def _add_robust_path(figure: go.Figure, plan: Plan, arm: int) -> None:
         marker={"color": ROBUST_COLOUR, "size": 3},
     )
     triplets = plan.trajectory.triplets[:, arm]
+    for finger in (1, 2):
+        look = {"mode": "lines", "line": {"color": ROBUST_COLOUR, "width": 3, "dash": "dot"}, "legendgroup": "swept"}
+        _add_points(figure, triplets[:, finger], name="its fingertips", showlegend=arm == 0 and finger == 1, **look)
     poses = GripperTriangle.from_triplets(triplets).poses(triplets)
     for step in np.unique(np.linspace(0, len(poses) - 1, AXIS_STEPS).astype(int)):
         origin, rotation = poses[step, :3, 3], poses[step, :3, :3]

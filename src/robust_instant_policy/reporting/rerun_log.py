@@ -21,8 +21,9 @@ import numpy as np
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import MissingExtraError, RipError, UsageError
 from robust_instant_policy.files import PART_SUFFIX, excerpt, make_folder, require_replaceable
-from robust_instant_policy.geometry import FloatArray, lift
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.policy import Plan
+from robust_instant_policy.reporting.pictures import scene_points
 from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_FILE
 from robust_instant_policy.robots.path import MeasuredPath
 from robust_instant_policy.trajectory import Trajectory
@@ -177,18 +178,8 @@ def _log_observation(recording: rr.RecordingStream, observation: Observation) ->
     )
     recording.log("world/camera/rgb", rr.Image(observation.rgb))
     recording.log("world/camera/depth", rr.DepthImage(np.nan_to_num(observation.depth), meter=1.0))
-    points, colours = _points(observation)
+    points, colours = scene_points(observation, MAX_POINTS)
     recording.log("world/points", rr.Points3D(points, colors=colours, radii=POINT_M))
-
-
-def _points(observation: Observation) -> tuple[FloatArray, np.ndarray]:
-    """At most `MAX_POINTS` points ``(N, 3)``, world, metres, and their colours ``(N, 3)`` uint8."""
-    rows, columns = np.nonzero(observation.depth > 0)
-    every = slice(None, None, max(1, -(-len(rows) // MAX_POINTS)))
-    rows, columns = rows[every], columns[every]
-    pixels = np.column_stack([columns, rows])
-    points = lift(pixels, observation.depth[rows, columns], observation.intrinsics, observation.camera_pose)
-    return points, observation.rgb[rows, columns]
 
 
 def _log_candidate(recording: rr.RecordingStream, index: int, candidate: Trajectory, plan: Plan) -> None:

@@ -124,7 +124,7 @@ def write_report(folder: str | Path) -> Path:
         keypoints=_keypoint_table(plan),
         framed=_frames_over_scene(observation, plan),
         frames=_frame_table(plan),
-        paths=chart(paths_in_space(plan)),
+        paths=chart(paths_in_space(plan, observation)),
         judged=plan.confidence is not None,
         candidates=_candidate_table(plan),
         weights=chart(weights_over_time(plan)) if plan.candidates else "",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -17,6 +18,8 @@ from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 MAX_TEXTURE_PIXELS = 512
 ROUGHNESS = 0.75
+UNLIT = "KHR_materials_unlit"
+WIDE_M2, UP = 0.1, 0.9  # area from which faces are wide, and vertical part of a normal that looks up
 TUBE_SIDES = 12
 TUBE_M = (0.003, 0.06)  # least and largest radius that is drawn
 DASH = 2  # steps of a dash, and of the gap behind it
@@ -33,20 +36,44 @@ def digest(surfaces: Sequence[Surface]) -> str:
 
 
 def glb(surfaces: Sequence[Surface]) -> bytes:
-    """The ``surfaces`` of one body as a binary glTF file."""
+    """The ``surfaces`` of one body as a binary glTF file. Wide faces that look up are drawn without lighting: lighting
+    them takes a browser without a GPU a third of its time, and would change their colours by a few percent."""
     scene = trimesh.Scene()
     for surface in surfaces:
-        material = trimesh.visual.material.PBRMaterial(
-            baseColorFactor=np.clip(surface.colour * 255, 0, 255).astype(np.uint8),
-            metallicFactor=0.0,
-            roughnessFactor=ROUGHNESS,
-            baseColorTexture=None if surface.texture is None else _image(surface.texture),
-        )
-        visual = trimesh.visual.TextureVisuals(uv=surface.uvs, material=material)
-        scene.add_geometry(trimesh.Trimesh(surface.vertices, surface.faces, visual=visual, process=False))
+        wide = _looks_up(surface)
+        for faces, name in ((surface.faces[~wide], "lit"), (surface.faces[wide], UNLIT)):
+            if len(faces):
+                scene.add_geometry(_mesh(surface, faces, name))
     with io.BytesIO() as buffer:
-        scene.export(buffer, file_type="glb")
+        scene.export(buffer, file_type="glb", tree_postprocessor=_mark_unlit)
         return buffer.getvalue()
+
+
+def _looks_up(surface: Surface) -> np.ndarray:
+    """Which of the ``faces (F,)`` look up, where these are wide in all."""
+    corners = surface.vertices[surface.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # twice as long as the area
+    up = normals[:, 2] > UP * np.linalg.norm(normals, axis=1)
+    return up & (normals[up, 2].sum() / 2 > WIDE_M2)
+
+
+def _mesh(surface: Surface, faces: np.ndarray, name: str) -> trimesh.Trimesh:
+    material = trimesh.visual.material.PBRMaterial(
+        name=name,
+        baseColorFactor=np.clip(surface.colour * 255, 0, 255).astype(np.uint8),
+        metallicFactor=0.0,
+        roughnessFactor=ROUGHNESS,
+        baseColorTexture=None if surface.texture is None else _image(surface.texture),
+    )
+    visual = trimesh.visual.TextureVisuals(uv=surface.uvs, material=material)
+    return trimesh.Trimesh(surface.vertices, faces, visual=visual, process=False)
+
+
+def _mark_unlit(tree: dict[str, Any]) -> None:
+    for material in tree.get("materials", ()):
+        if material["name"] == UNLIT:
+            material["extensions"] = {UNLIT: {}}
+            tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), UNLIT})
 
 
 def _image(texture: np.ndarray) -> Image.Image:

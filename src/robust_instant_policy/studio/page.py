@@ -91,7 +91,7 @@ class Page:
                 self.session,
                 self._controls,
                 llm,
-                demonstrations=lambda: self.demonstrations,
+                demonstrations=self._others,
                 new_scene=self._new_scene,
                 on_forget=lambda: self._acts.forget(),
             )
@@ -136,6 +136,7 @@ class Page:
                 place(gizmo, targets[index])
                 self._targets[index] = targets[index]
         self._tell(*self._situation(status))
+        self._server.flush()  # do not wait for more messages
 
     def on_kept(self, demonstration: Demonstration, folder: Path, count: int) -> None:
         self.demonstrations.append(demonstration)
@@ -158,9 +159,10 @@ class Page:
 
     def _build(self) -> None:
         gui, held, session = self._gui, self._controls.held, self.session
-        gui.add_markdown(HOW_TO)
+        how_to = gui.add_markdown(HOW_TO)
         self._kept = gui.add_markdown("")
-        gui.add_button("Keep (Enter)", icon=viser.Icon.CHECK, color="green").on_click(held(self._keep))
+        keep = gui.add_button("Keep (Enter)", icon=viser.Icon.CHECK, color="green")
+        keep.on_click(held(self._keep))
         grip = gui.add_button("Close / open gripper (Space)", icon=viser.Icon.ARROWS_HORIZONTAL)
         grip.on_click(held(lambda _: session.post(lambda: session.grip(self._arm))))
         undo = gui.add_button("Undo (Z)", icon=viser.Icon.ARROW_BACK_UP)
@@ -170,6 +172,7 @@ class Page:
         discard.on_click(held(lambda _: session.post(session.discard)))
         scene = gui.add_button("Another scene", icon=viser.Icon.DICE, color="gray")
         scene.on_click(held(lambda _: session.post(self._new_scene)))
+        self._with_arms = (how_to, keep, grip, undo, self._back, discard)
 
     def _bind_keys(self) -> None:
         held, session = self._controls.held, self.session
@@ -193,16 +196,24 @@ class Page:
             raise
         self._task.value = self._opened = task
         self._tell(markup.GREY, f"Opening {task} …")
+        self.session.close()
         try:
             folder = self.folder
             self.demonstrations = stored_demonstrations(folder, task, MANY) if folder.exists() else []
             self._count()
-            self.session.open(lambda: self._make_cell(task, self.demonstrations))
+            cell = self._make_cell(task, self.demonstrations)
+            for control in self._with_arms:
+                control.visible = bool(cell.arms)
+            self.session.open(cell)
             self._new_scene()
         except Exception as error:
             told = str(error) if isinstance(error, RipError) else "see the terminal"
             self._tell(markup.RED, f"{task} cannot be opened: {told}")
             raise
+
+    def _others(self) -> list[Demonstration]:
+        """The demonstrations, less the one whose scene is shown, where there is no simulator."""
+        return [one for one in self.demonstrations if one.observation is not self.session.observation]
 
     def _new_scene(self) -> None:
         """Draw the scene after the present one and all demonstrated ones; the scenes of evaluations stay unseen."""
@@ -213,7 +224,9 @@ class Page:
 
     def _count(self) -> None:
         kept = len(self.demonstrations)
-        words = f"**{kept} demonstration{'' if kept == 1 else 's'} kept** in `{self.folder}` (aim: ten)"
+        words = f"**{kept} demonstration{'' if kept == 1 else 's'} kept** in `{self.folder}`"
+        if self._grippers:
+            words += " (aim: ten)"
         if len(self._grippers) > 1:
             words += f"\n\nKeys move the **{self._grippers[self._arm]}** gripper; **C** changes to the other."
         self._kept.content = words

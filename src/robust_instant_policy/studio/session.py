@@ -120,11 +120,11 @@ class Session:
             self.cell.close()
             self.cell, self.seed, self.status = None, None, Status()
 
-    def open(self, make_cell: Callable[[], Cell]) -> None:
+    def open(self, cell: Cell) -> None:
         """Replace the cell; `new_scene` draws its first scene. Raises `UsageError` while recording."""
         self.require_no_recording()
         self.close()
-        self.cell = make_cell()
+        self.cell = cell
 
     def new_scene(self, seed: int) -> None:
         """Draw the scene of ``seed``; raises `UsageError` while recording."""
@@ -242,6 +242,8 @@ class Session:
         self.require_no_recording()
         self._draw(self.seed)
         assert self.cell is not None
+        self._set(phase="playing")
+        self._show()
         for command in motion.commands:
             if is_stopped() or self._stopped:
                 break

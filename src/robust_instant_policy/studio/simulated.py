@@ -18,6 +18,8 @@ SETTLE_S = 0.5  # for objects that were moved by hand to come to rest
 GAMMA = 2.2  # of the colours that MuJoCo takes; surfaces have linear ones
 BACKDROP = ("ground", "mat")  # bodies that are not drawn: they hide the table or the page's own floor
 FURNITURE = ("table-workspace", *BACKDROP)
+PAINT_M = 1e-4  # discs that lie on each other by less are drawn APART times farther apart, or a browser mixes them
+APART = 30
 
 
 class SimulatedCell:
@@ -95,8 +97,10 @@ class _SapienBodies:
         for name, entity in self._entities().items():
             for component in entity.components:
                 if isinstance(component, sapien.render.RenderBodyComponent):
-                    for shape in component.render_shapes:
-                        yield from _sapien_surfaces(name, shape)
+                    shapes = component.render_shapes
+                    lowest = min((shape.half_length for shape in shapes if hasattr(shape, "half_length")), default=0.0)
+                    for shape in shapes:
+                        yield from _sapien_surfaces(name, shape, lowest)
 
     def poses(self) -> dict[str, FloatArray]:
         found = self._entities().items()
@@ -110,10 +114,16 @@ class _SapienBodies:
         return entities
 
 
-def _sapien_surfaces(body: str, shape: Any) -> Iterator[Surface]:
+def _sapien_surfaces(body: str, shape: Any, lowest: float) -> Iterator[Surface]:
+    """Surfaces of a ``shape`` of a body whose shortest cylinder has the half length ``lowest``, metres."""
+
+    def half_length() -> float:
+        above = shape.half_length - lowest
+        return lowest + (APART * above if above < PAINT_M else above)
+
     scales = {  # of the unit shapes that SAPIEN has for its primitives
         "RenderShapeBox": lambda: shape.half_size,
-        "RenderShapeCylinder": lambda: (shape.half_length, shape.radius, shape.radius),
+        "RenderShapeCylinder": lambda: (half_length(), shape.radius, shape.radius),
         "RenderShapeSphere": lambda: (shape.radius,) * 3,
         "RenderShapeTriangleMesh": lambda: shape.scale,
     }

@@ -17,10 +17,11 @@ def seconds_of(name: str, stamps: FloatArray, rate_hz: float) -> FloatArray | No
     those of even frames at ``rate_hz``, or all equal. Raises `DatasetError` for times that go back."""
     if len(stamps) < 2 or not np.ptp(stamps):
         return None
-    if not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
-        raise DatasetError(f"{name}: its timestamps do not increase; restore it, or record the episode again")
+    gaps = np.diff(stamps)
+    if not np.isfinite(stamps).all() or (gaps < 0).any():
+        raise DatasetError(f"{name}: its timestamps go back; restore it, or record the episode again")
     stamps = stamps - stamps[0]
-    unit = min(UNITS_S, key=lambda unit: abs(np.log(np.median(np.diff(stamps)) * unit * rate_hz)))
+    unit = min(UNITS_S, key=lambda unit: abs(np.log(np.median(gaps[gaps > 0]) * unit * rate_hz)))
     seconds = stamps * unit
     even = np.arange(len(stamps)) / rate_hz
     return None if np.abs(seconds - even).max() <= UNEVEN / rate_hz else seconds
@@ -32,7 +33,11 @@ def even_steps(seconds: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def resampled(poses: FloatArray, seconds: FloatArray, times: FloatArray) -> FloatArray:
-    """``poses (T, A, 4, 4)`` at other ``times (M,)``: positions linear in time, rotations on the shortest way."""
+    """``poses (T, A, 4, 4)`` at other ``times (M,)``: positions linear in time, rotations on the shortest way. Of
+    frames at the same time the first one counts.
+    """
+    seconds, first = np.unique(seconds, return_index=True)
+    poses = poses[first]
     result = np.tile(np.eye(4), (len(times), poses.shape[1], 1, 1))
     for arm in range(poses.shape[1]):
         for axis in range(3):

@@ -34,7 +34,8 @@ class RealSenseCamera:
     """A D415, D405, D435 or D455; see `robots.camera.Camera`.
 
     ``serial`` empty takes the only one connected. ``burst`` frames are combined into one depth image by the temporal
-    filter; 1 for live pictures. A ``device`` of the SDK may be given instead of a serial number.
+    filter; 1 for live pictures. A ``device`` of the SDK may be given instead of a serial number. `read` waits for a new
+    pair of frames for ``timeout_s``.
     """
 
     def __init__(
@@ -45,9 +46,10 @@ class RealSenseCamera:
         rate_hz: int = 30,
         burst: int = BURST,
         device: Any | None = None,
+        timeout_s: float = TIMEOUT_S,
     ):
         self.name = f"realsense {serial}".strip()
-        self._serial, self._device = serial, device
+        self._serial, self._device, self._timeout_s = serial, device, timeout_s
         self._width, self._height, self._rate_hz, self._burst = width, height, rate_hz, burst
         self._sensors: list[Any] = []
         self._last = (-1, -1)  # numbers of the last depth and colour frame
@@ -136,7 +138,7 @@ class RealSenseCamera:
 
     def _pair(self) -> Any:
         """The next frameset with new frames of both streams, taken at one time."""
-        deadline = time.monotonic() + TIMEOUT_S
+        deadline = time.monotonic() + self._timeout_s
         while (left := deadline - time.monotonic()) > 0:
             found, frames = self._syncer.try_wait_for_frames(max(round(left * 1e3), 1))
             if not found:
@@ -152,8 +154,8 @@ class RealSenseCamera:
             self._last = numbers
             return frames
         raise RobotError(
-            f"{self.name} has sent no new pair of colour and depth for {TIMEOUT_S:g} s: check the cable and the USB 3 "
-            "port, then connect again"
+            f"{self.name} has sent no new pair of colour and depth for {self._timeout_s:g} s: check the cable and the "
+            "USB 3 port, then connect again"
         )
 
 
