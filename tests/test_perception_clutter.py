@@ -172,20 +172,3 @@ def test_a_thing_that_a_rod_hides_in_part_is_one_thing_and_found():
     errors = np.linalg.norm(places[:, :2] - extractor.keypoints_[0, :, :2] - moved, axis=1)
     assert np.median(errors) < 0.005
     assert errors.max() < 0.02
-
-
-def test_of_two_alike_things_each_keeps_its_own_keypoints_whichever_is_found_first():
-    """Both are of one colour; the taller one fits nearly as well where the flat one stands."""
-    blue = (40, 90, 180), (40, 90, 180)
-
-    def scene(seed: int):
-        (x, y), (u, v) = places(seed, 2)
-        blocks = [(x, y, 0.035, 0.05, blue), (u, v, 0.030, 0.05, blue)]
-        return blocks, photograph(blocks, size=256)
-
-    scenes = [scene(seed) for seed in range(6)]
-    extractor = KeypointExtractor(features="efficientnet").fit([image for _, image in scenes[:3]])
-    known = owners(extractor.pixels_[0], scenes[0][1], scenes[0][0])
-    assert set(known) == {0, 1}
-    for blocks, image in scenes[3:]:
-        assert owners(extractor.locate(image).pixels, image, blocks) == known
