@@ -1,14 +1,15 @@
 """Accuracy, processor time and memory of the keypoints.
 
     python benchmarks/perception.py accuracy             # against the simulator's truth, all tasks
+    python benchmarks/perception.py hard                 # the same in hard scenes, with the confidence; resumable
     python benchmarks/perception.py real DIR --out OUT   # photographs with outlines, see perception_real.py
     python benchmarks/perception.py picture              # docs/images/keypoints.jpg
     python benchmarks/perception.py speed                # ratios to one pass of the network
     python benchmarks/perception.py speed --reference CHECKOUT    # beside ShirAmir/dino-vit-features
     python benchmarks/perception.py speed --features dino --columns real      # one line of the table
 
-Writes `docs/tables/perception_accuracy.md` and `docs/tables/perception_speed.md`; keeps each line of the latter in
-`results/perception_speed.json`.
+Writes `docs/tables/perception_accuracy.md`, `perception_hard.md` and `perception_speed.md`; keeps each scene of the
+second in `results/perception_hard.jsonl` and each line of the third in `results/perception_speed.json`.
 """
 
 from __future__ import annotations
@@ -30,10 +31,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from dino_reference import ReferenceTransformer, load_reference, random_checkpoint
+from perception_hard import hard
 from perception_real import real
 from PIL import Image, ImageDraw
 
 from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.evaluation.paper import TABLE1_TASKS
+from robust_instant_policy.evaluation.scenes import SPLITS
 from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception import (
@@ -278,6 +282,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("accuracy").add_argument("--tasks", nargs="*", default=list(SIMULATION_TASKS))
+    harder = commands.add_parser("hard")
+    harder.add_argument("--tasks", nargs="*", default=list(TABLE1_TASKS))
+    harder.add_argument("--split", choices=list(SPLITS), default="test", help="tune thresholds on the other one")
+    harder.add_argument("--scenes", type=int, default=NEW_SCENES)
+    harder.add_argument("--data", type=Path, default=ROOT / "data" / "hard", help="folder of the demonstrations")
+    harder.add_argument("--rows", type=Path, default=ROOT / "results" / "perception_hard.jsonl")
+    harder.add_argument("--table", type=Path, default=TABLES / "perception_hard.md")
     commands.add_parser("picture").add_argument("--task", default="open-drawer")
     photographs = commands.add_parser("real")
     photographs.add_argument("folder", type=Path)
@@ -295,6 +306,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.command == "accuracy":
         accuracy([name for name in arguments.tasks if not name.startswith("aloha")])
+    elif arguments.command == "hard":
+        hard(arguments.tasks, arguments.split, arguments.scenes, arguments.data, arguments.rows, arguments.table)
     elif arguments.command == "real":
         if not (arguments.folder / "pair.json").exists():
             parser.error(f"{arguments.folder} holds no pair.json; perception_real.py describes the folder")

@@ -38,6 +38,7 @@ REST_MS = 2000  # between presses, for the arm to come to rest in the picture
 CHANGED, CHANGED_PIXELS = 40, 30  # difference of a colour, and number of pixels, from which the arm has moved
 PATIENCE_MS = 300_000
 TASKS_IN_TURN = 10
+FIRST_TASK = "push-cube"
 
 
 def main() -> None:
@@ -62,7 +63,7 @@ def main() -> None:
             "--demos",
             f"{folder}/demos",
         ]
-        server = subprocess.Popen([*command, "--task", "push-cube"], stdout=subprocess.PIPE, text=True)
+        server = subprocess.Popen([*command, "--task", FIRST_TASK], stdout=subprocess.PIPE, text=True)
         try:
             assert server.stdout is not None
             address = re.search(r"http://\S+", server.stdout.readline())
@@ -169,7 +170,8 @@ def use(page: Page, seconds: float) -> int:
 def tasks_in_turn(page: Page) -> list[float]:
     """Seconds to open each of ten tasks."""
     seconds = []
-    for name in (*TASK_NAMES[1:TASKS_IN_TURN], TASK_NAMES[0]):
+    others = [name for name in TASK_NAMES if name != FIRST_TASK]
+    for name in (*others[: TASKS_IN_TURN - 1], FIRST_TASK):
         start, before = time.monotonic(), page.inner_text("#studio-banner")
         tasks = page.locator("input.mantine-Select-input:visible").first
         tasks.fill(name)

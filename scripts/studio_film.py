@@ -118,9 +118,11 @@ def main() -> None:
         camera = Camera(view)
         demonstrate(view, session)
         still(view, options.images / "studio-show.jpg")
+        view.keyboard.press("x")
+        banner(view, "Your turn")
         view.get_by_role("tab", name="Plan").click()
         view.get_by_role("button", name="New scene").click()
-        banner(view, "Your turn")
+        ask(session, lambda one: one.seed)  # the new scene is drawn
         view.wait_for_timeout(1500)
         view.get_by_role("button", name="Plan", exact=True).click()
         view.get_by_text("5 of 5 candidates").wait_for(timeout=1000 * PATIENCE_S)

@@ -22,7 +22,9 @@ DEMOS_FOR_MEDIANS = 5  # with fewer, an outlier cannot be identified
 OUTLIER_M = 0.006  # residual at which a keypoint's influence on a fitted pose is halved
 SHAPE_TOLERANCE = 0.15  # of a thing's size: how far its shape may vary beside its size
 LEAST_SWING_RAD = 0.2  # a part that turns less than this shows no hinge
+LEVEL_RAD = 0.2  # usual tilt of a hinge's axis from the horizontal or the vertical; short arcs show the axis badly
 LEAST_SCALED = 4  # keypoints of a thing of varying size: two define it
+LEAST_GROWTH = 0.1  # standard deviation of a thing's size, relative; one that varies less shows no size
 SIZE_EXPLAINS = 0.7  # relative spread of distances when divided by the size, below which a thing has one
 MAX_THINGS = 4  # of several keypoints: those of the most keypoints
 MIRRORED_DEMOS = 2  # in which a thing has the other hand: a single one may be an error
@@ -211,7 +213,8 @@ def _scaled(keypoints: FloatArray, tolerance: float) -> list[Thing]:
         size = _rms_radius(points)
         distances = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
         relative = distances * (size.mean() / size)[:, None, None]
-        if spread(relative).sum() < SIZE_EXPLAINS * spread(distances).sum():
+        explained = spread(relative).sum() < SIZE_EXPLAINS * spread(distances).sum()
+        if explained and size.std() > LEAST_GROWTH * size.mean():
             unit = points * (size.mean() / size)[:, None, None]
             things.append(Thing("scaled", members, _mean_shape(unit, True, np.inf)[0]))
     return things
@@ -224,16 +227,16 @@ def _rms_radius(points: FloatArray) -> FloatArray:
 
 def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) -> list[Thing]:
     """Rigid things that turn about an axis fixed in another one or in the world, at shares of their angle."""
-    rigid = {thing.members: thing for thing in things if thing.kind == "rigid"}
+    rigid = [thing.members for thing in things if thing.kind == "rigid"]
     bases = [WORLD, *(thing for thing in things if thing.kind in ("upright", "rigid"))]
-    found = locate([*bases, *rigid.values()], keypoints)
+    found = locate(bases, keypoints)
     hinged: list[Thing] = []
-    for members, part in rigid.items():
+    for members in rigid:
         fits = [
             (error, hinge, shape)
             for base in bases
             if base.members != members
-            for error, hinge, shape in _hinge(base, found[base], found[part], keypoints[:, list(members)])
+            for error, hinge, shape in _hinge(base, found[base], keypoints[:, list(members)])
             if error < tolerance
         ]
         if fits:
@@ -243,54 +246,55 @@ def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) ->
     return hinged
 
 
-def _hinge(
-    base: Thing, base_at: Located, part_at: Located, points: FloatArray
-) -> list[tuple[float, Hinge, FloatArray]]:
-    """The part's error (metres) as a part of ``base``, the hinge, and its shape about it; none where nothing swings
-    or no axis is in sight.
+def _hinge(base: Thing, base_at: Located, points: FloatArray) -> list[tuple[float, Hinge, FloatArray]]:
+    """The error (metres) of a part with ``points (I, N, 3)`` as one that turns about an axis of ``base``, the hinge,
+    and the part's shape about it; none where nothing swings or no axis is in sight.
 
-    Relative rotations about one axis have parallel rotation vectors, and their fixed points lie on the axis: a first
-    guess, which is then fitted to the part's ``points (I, N, 3)``.
+    Seen from the base, each point moves on a circle in a plane across the axis: a first guess, which is then fitted.
     """
-    back = np.swapaxes(base_at.rotation, -1, -2)
-    rotation = back @ part_at.rotation
-    position = (back @ (part_at.position - base_at.position)[..., None])[..., 0]
-    middle = Rotation.from_matrix(rotation).mean().as_matrix()
-    swings = Rotation.from_matrix(rotation @ middle.T).as_rotvec()
-    axis = np.linalg.svd(swings)[2][0]
-    if np.ptp(swings @ axis) < LEAST_SWING_RAD:
-        return []
-    turn = Rotation.from_rotvec(np.outer(swings @ axis, axis)).as_matrix()
-    # t_i = c + turn_i (t - c): linear in c and t
-    system = np.concatenate([np.eye(3) - turn, turn], axis=2).reshape(-1, 6)
-    solution = np.linalg.lstsq(system, position.ravel(), rcond=1e-2)[0]
-    off = np.linalg.norm((system @ solution - position.ravel()).reshape(-1, 3), axis=1)
-    if np.median(off) > RIGID_SPREADS * RIGID_SPREAD_M[1]:
-        return []
-    center = solution[:3]
-    frame = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])[0]
     local = (points - base_at.position[:, None]) @ base_at.rotation
+    swings = local - local.mean(axis=0)
+    frame = np.linalg.svd(swings.reshape(-1, 3), full_matrices=False)[2][[0, 1, 2]].T
+    frame[:, 1] *= np.linalg.det(frame)  # right-handed, z along the axis
+    circles = local @ frame[:, :2]  # |p|² = 2 p·c + a constant for each point: linear in the centre c
+    flat = circles - circles.mean(axis=0)
+    square = (circles**2).sum(axis=-1)
+    centre = np.linalg.lstsq(2 * flat.reshape(-1, 2), (square - square.mean(axis=0)).ravel(), rcond=1e-2)[0]
+    guess = frame @ np.append(centre, (local @ frame[:, 2]).mean())
+    if _off_axis(local, guess, frame)[0] > RIGID_SPREADS * RIGID_SPREAD_M[1]:
+        return []
 
     def residuals(x: FloatArray) -> FloatArray:
-        seen, turned = _about_axis(local, center + x[3:], (frame * Rotation.from_rotvec(x[:3])).as_matrix())
-        return np.append(((seen - turned) / OUTLIER_M).ravel(), 0.01 * x)  # turning or moving along the axis is free
+        rotation = frame @ Rotation.from_rotvec(x[:3]).as_matrix()
+        seen, turned, _ = _about_axis(local, guess + x[3:], rotation)
+        rise = float(np.arcsin(min(abs(rotation[2, 2]), 1.0)))
+        tilt = min(rise, np.pi / 2 - rise) / LEVEL_RAD if base.kind != "rigid" else 0.0
+        return np.concatenate([((seen - turned) / OUTLIER_M).ravel(), [tilt], 0.01 * x])  # the axis turns in itself
 
     x = least_squares(residuals, np.zeros(6), loss="soft_l1", max_nfev=20).x
-    hinge = Hinge(base, center + x[3:], (frame * Rotation.from_rotvec(x[:3])).as_matrix())
-    seen, turned = _about_axis(local, hinge.point, hinge.rotation)
-    error = float(np.sqrt(np.median(_squared(seen - turned))))
-    return [(error, hinge, turned[0])]
+    hinge = Hinge(base, guess + x[3:], frame @ Rotation.from_rotvec(x[:3]).as_matrix())
+    error, turned, angle = _off_axis(local, hinge.point, hinge.rotation)
+    return [(error, hinge, turned[0])] if np.ptp(angle) > LEAST_SWING_RAD else []
 
 
-def _about_axis(local: FloatArray, point: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``local (I, N, 3)`` in the axes of a hinge, and the same for a rigid part that turns about its z."""
+def _off_axis(local: FloatArray, point: FloatArray, rotation: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """The error (metres) of a part that turns about an axis, its points and angles (`_about_axis`)."""
+    seen, turned, angle = _about_axis(local, point, rotation)
+    return float(np.sqrt(np.median(_squared(seen - turned)))), turned, angle
+
+
+def _about_axis(
+    local: FloatArray, point: FloatArray, rotation: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``local (I, N, 3)`` in the axes of a hinge, the same for a rigid part that turns about its z, and the part's
+    angles ``(I,)``, continuous, from the first scene's."""
     seen = (local - point) @ rotation
     shape = seen[0]
     for _ in range(2):
         angle = np.angle((np.conj(_complex(shape)) * _complex(seen)).sum(axis=1))
         shape = (seen @ rotations_about_vertical(angle)).mean(axis=0)
     turned = shape @ np.swapaxes(rotations_about_vertical(angle), -1, -2)
-    return seen, turned
+    return seen, turned, angle
 
 
 def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArray:

@@ -8,7 +8,7 @@ median, over the demonstrations, of its coordinates in the part's frame. Where t
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.geometry import FloatArray, invert_pose, lift, transform_points
+from robust_instant_policy.geometry import FloatArray, invert_pose, lift, rotations_about_vertical, transform_points
 from robust_instant_policy.perception.keypoints import KeypointExtractor, Located
 
 MIN_MOTION_M = 0.002  # of a part between scenes; less is background
@@ -77,35 +77,61 @@ def measure(
     scenes: Sequence[Observation],
     scenes_known: Sequence[KnownScene],
     camera: Callable[[Observation, int], Observation] | None = None,
+    symmetries: Mapping[str, int] | None = None,
 ) -> Accuracy:
     """Locate the keypoints of a fitted ``extractor`` in new ``scenes`` and compare them with the truth.
 
     ``demonstrations`` are the images it was fitted to, ``known`` their truth, all as rendered; ``camera`` makes the
-    extractor's image from a scene and its number.
+    extractor's image from a scene and its number. ``symmetries`` are, by name, the parts that look the same after each
+    n-th of a turn about the vertical through their frame's origin.
     """
     located = tuple(
         extractor.locate(scene if camera is None else camera(scene, number)) for number, scene in enumerate(scenes)
     )
     moving = _moving_parts([*known, *scenes_known])
     part_of = tuple(_part_of(pixels, known, moving) for pixels in np.swapaxes(extractor.pixels_, 0, 1))
-    truth = np.full((len(scenes), len(part_of), 3), np.nan)
-    for k, part in enumerate(part_of):
-        if not part:
-            continue
-        boxes = np.array([_extent(o, s, part) for o, s in zip(demonstrations, known, strict=True)])
-        new_boxes = np.array([_extent(o, s, part) for o, s in zip(scenes, scenes_known, strict=True)])
-        pairs = zip(extractor.keypoints_[:, k], known, strict=True)
-        places = np.array([transform_points(invert_pose(_pose(s, part)), point) for point, s in pairs])
-        sizes = np.diff(np.concatenate([boxes, new_boxes]), axis=1)[:, 0]
+    found = np.array([image.keypoints for image in located])
+    truth = np.full(found.shape, np.nan)
+    for part in sorted({*part_of} - {""}):
+        own = [k for k, name in enumerate(part_of) if name == part]
+        symmetry = (symmetries or {}).get(part, 1)
+        places = _places(extractor.keypoints_[:, own], [_looks(_pose(scene, part), symmetry) for scene in known])
+        boxes = np.array([_extent(o, s, part) for o, s in zip(demonstrations, known, strict=True)])[:, :, None]
+        new_boxes = np.array([_extent(o, s, part) for o, s in zip(scenes, scenes_known, strict=True)])[:, :, None]
+        sizes = np.diff(np.concatenate([boxes, new_boxes]), axis=1)
         if np.nanmax(np.nanmax(sizes, axis=0) - np.nanmin(sizes, axis=0)) < SAME_SIZE_M:
-            wanted = np.tile(np.median(places, axis=0), (len(scenes), 1))
+            wanted = np.tile(np.median(places, axis=0), (len(scenes), 1, 1))
         else:
             size = np.maximum(boxes[:, 1] - boxes[:, 0], 1e-6)
             share = np.nanmedian((places - boxes[:, 0]) / size, axis=0)
             wanted = new_boxes[:, 0] + share * (new_boxes[:, 1] - new_boxes[:, 0])
-        truth[:, k] = [transform_points(_pose(s, part), place) for s, place in zip(scenes_known, wanted, strict=True)]
-    found = np.array([image.keypoints for image in located])
+        for number, scene in enumerate(scenes_known):
+            possible = [transform_points(pose, wanted[number]) for pose in _looks(_pose(scene, part), symmetry)]
+            truth[number, own] = _nearest(possible, found[number, own])
     return Accuracy(np.linalg.norm(found - truth, axis=2), part_of, located, truth)
+
+
+def _looks(pose: FloatArray, symmetry: int) -> FloatArray:
+    """The poses ``(symmetry, 4, 4)`` in which a part at ``pose (4, 4)`` looks the same."""
+    turned = np.repeat(pose[None], symmetry, axis=0)
+    turned[:, :3, :3] = rotations_about_vertical(2 * np.pi * np.arange(symmetry) / symmetry) @ pose[:3, :3]
+    return turned
+
+
+def _places(keypoints: FloatArray, looks: Sequence[FloatArray]) -> FloatArray:
+    """``keypoints (I, k, 3)`` of a part in its own frame, at those of its poses ``looks`` in which they agree."""
+    first = transform_points(invert_pose(looks[0][0]), keypoints[0])
+    return np.array(
+        [
+            _nearest([transform_points(invert_pose(pose), points) for pose in poses], first)
+            for points, poses in zip(keypoints, looks, strict=True)
+        ]
+    )
+
+
+def _nearest(possible: Sequence[FloatArray], points: FloatArray) -> FloatArray:
+    """The one of ``possible (k, 3)`` with the least sum of distances from ``points (k, 3)``."""
+    return min(possible, key=lambda one: float(np.linalg.norm(one - points, axis=1).sum()))
 
 
 def _pose(scene: KnownScene, part: str) -> FloatArray:
