@@ -298,17 +298,18 @@ def lerobot_folder(path, names, state_of, depth=True, key="observation.state"):
 
 
 def add_features(path, values_of, dtype="float32"):
-    """Add features, or replace them, with the values ``(T,)`` or ``(T, 1)`` that functions make of a demonstration."""
+    """Add features, or replace them, with the values ``(T,)`` or ``(T, D)`` that functions make of a demonstration."""
     file = path / "data/chunk-000/file-000.parquet"
     table, info = pq.read_table(file), json.loads((path / "meta/info.json").read_text())
     for key, values in values_of.items():
-        rows = np.concatenate(
-            [np.ravel(values(demonstration(seed, steps=length))) for seed, length in ((0, 20), (1, 30))]
-        )
+        rows = np.concatenate([values(demonstration(seed, steps=length)) for seed, length in ((0, 20), (1, 30))])
+        width = int(rows.size / len(rows))
+        rows = np.ravel(rows).tolist() if width == 1 else rows.tolist()
         if key in table.column_names:
             table = table.drop_columns([key])
-        table = table.append_column(key, pa.array(rows, pa.float64() if dtype == "float64" else pa.float32()))
-        info["features"][key] = {"dtype": dtype, "shape": [1], "names": None}
+        kind = pa.float64() if dtype == "float64" else pa.float32()
+        table = table.append_column(key, pa.array(rows, kind if width == 1 else pa.list_(kind)))
+        info["features"][key] = {"dtype": dtype, "shape": [width], "names": None}
     pq.write_table(table, file)
     (path / "meta/info.json").write_text(json.dumps(info))
 
@@ -518,6 +519,31 @@ def test_poses_without_names_are_read_as_is_usual_for_their_feature(tmp_path, ke
     path = lerobot_folder(tmp_path / "theirs", None, layout(rotation, gripper=False), key=key)
     gripper = {"observation.gripper_position": lambda demo: 100 * (1 - demo.trajectory.gripper_state)}
     add_features(path, gripper)
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
+        expected = tilted(demonstration(seed, steps=len(demo.trajectory)))
+        np.testing.assert_allclose(demonstration_poses(demo), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("position", "turn", "rotation"),
+    [
+        ("ee_pos", "ee_quat", xyzw),
+        ("ee_position", "ee_euler", rpy),
+        ("eef.left_xyz", "eef.left_axis_angle", rotvec),
+    ],
+)
+def test_position_and_rotation_may_be_features_of_their_own(tmp_path, position, turn, rotation):
+    path = lerobot_folder(tmp_path / "theirs", ["joint_1", "joint_2"], lambda demo: np.zeros((len(demo.trajectory), 2)))
+    pose = layout(rotation, gripper=False)
+    add_features(
+        path,
+        {
+            f"observation.{turn}": lambda demo: pose(demo)[:, 3:],
+            f"observation.{position}": lambda demo: pose(demo)[:, :3],
+            "observation.joint_pos": lambda demo: pose(demo)[:, :3] + 1,
+            "observation.gripper": lambda demo: 100 * (1 - demo.trajectory.gripper_state),
+        },
+    )
     for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
         expected = tilted(demonstration(seed, steps=len(demo.trajectory)))
         np.testing.assert_allclose(demonstration_poses(demo), expected, atol=1e-5)

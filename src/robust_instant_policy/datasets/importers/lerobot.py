@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from robust_instant_policy.datasets.importers.hdf5 import choose_camera
 from robust_instant_policy.datasets.importers.joints import JointModel
 from robust_instant_policy.datasets.importers.layouts import (
     ARMS,
+    POSITION,
     Columns,
     arm_of,
     axis_names,
@@ -40,6 +42,12 @@ from robust_instant_policy.files import excerpt
 from robust_instant_policy.geometry import FloatArray, as_numbers
 
 UNNAMED_POSES = {"cartesian_position": "rpy", "ee_pose": None, "eef_pose": None, "tcp_pose": None}  # and their rotation
+POSITION_FEATURES = (["pos"], ["position"], ["xyz"], ["translation"])  # last words of their names
+ROTATION_FEATURES: dict[tuple[str, ...], str | None] = {  # and which rotation three numbers are
+    **{(word,): None for word in ("quat", "quaternion", "rot", "rotation", "ori", "orientation")},
+    **{(word,): "rpy" for word in ("rpy", "euler")},
+    **{words: "rotvec" for words in (("rotvec",), ("axis", "angle"), ("axisangle",))},
+}
 ADVICE = (
     "A LeRobot dataset names the axes of a pose ee.x, ee.y, ee.z and a rotation (ee.wx …, rx …, roll …, qx … qw), or "
     "the rig says where it is (pose_key, rotation) or how to compute it (joints: urdf, link), and which feature holds "
@@ -131,8 +139,35 @@ def _poses(folder: Folder, episode: int, rig: Rig) -> FloatArray | None:
                 arms[arm] = poses_of(name, values, columns, rig.position_unit_m, rig.rotation_unit_rad, rig.tool)
         if {"left", "right"} <= arms.keys() or "" in arms:
             break
+    for arm, key, values, columns in () if arms else _in_two_features(folder, episode, where, rig):
+        if arm not in arms:
+            name = f"{folder.root} (episode {episode}, {key})"
+            arms[arm] = poses_of(name, values, columns, rig.position_unit_m, rig.rotation_unit_rad, rig.tool)
     chosen = [arms[arm] for arm in ARMS if arm in arms] or list(arms.values())
     return np.stack(chosen, axis=1) if chosen else None
+
+
+def _in_two_features(
+    folder: Folder, episode: int, where: list[str], rig: Rig
+) -> Iterator[tuple[str, str, FloatArray, Columns]]:
+    """Arm, feature of the rotation, position and rotation ``(T, D)``, and what they are, where a feature in ``where``
+    holds a position and one of the same name its rotation, such as ``ee_pos`` and ``ee_quat``."""
+    features = folder.info["features"]
+    for key, other in product(where, _vectors(folder)):
+        own, turn = ([word for word in words_of(one) if word not in ARMS] for one in (key, other))
+        ending = next((ending for ending in ROTATION_FEATURES if turn[-len(ending) :] == list(ending)), None)
+        if ending is None or own[-1:] not in POSITION_FEATURES or own[:-1] != turn[: -len(ending)]:
+            continue
+        position, rotation = folder.matrix(episode, key), folder.matrix(episode, other)
+        if arm_of(key) != arm_of(other) or position.shape[1] != len(POSITION):
+            continue
+        names = [name for name in axis_names(features[key]) if name in POSITION]
+        order = [names.index(axis) for axis in POSITION] if len({*names}) == len(POSITION) else [0, 1, 2]
+        told = rig.rotation or (ROTATION_FEATURES[ending] if rotation.shape[1] == 3 else None)
+        columns = pose_columns([*POSITION, *axis_names(features[other])], rig.rotation)
+        columns = columns or [one for one in [unnamed_columns(3 + rotation.shape[1], told)] if one is not None]
+        if columns:
+            yield arm_of(key), other, np.concatenate([position[:, order], rotation], axis=1), columns[0]
 
 
 def _unnamed(folder: Folder, key: str, names: list[str], rig: Rig) -> list[Columns]:
