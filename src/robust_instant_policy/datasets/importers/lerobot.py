@@ -42,7 +42,7 @@ from robust_instant_policy.files import excerpt
 from robust_instant_policy.geometry import FloatArray, as_numbers
 
 UNNAMED_POSES = {"cartesian_position": "rpy", "ee_pose": None, "eef_pose": None, "tcp_pose": None}  # and their rotation
-POSITION_FEATURES = (["pos"], ["position"], ["xyz"], ["translation"])  # last words of their names
+POSITION_FEATURES = ("pos", "position", "xyz", "translation")  # last words of their names
 ROTATION_FEATURES: dict[tuple[str, ...], str | None] = {  # and which rotation three numbers are
     **{(word,): None for word in ("quat", "quaternion", "rot", "rotation", "ori", "orientation")},
     **{(word,): "rpy" for word in ("rpy", "euler")},
@@ -156,7 +156,7 @@ def _in_two_features(
     for key, other in product(where, _vectors(folder)):
         own, turn = ([word for word in words_of(one) if word not in ARMS] for one in (key, other))
         ending = next((ending for ending in ROTATION_FEATURES if turn[-len(ending) :] == list(ending)), None)
-        if ending is None or own[-1:] not in POSITION_FEATURES or own[:-1] != turn[: -len(ending)]:
+        if ending is None or not own or own[-1] not in POSITION_FEATURES or own[:-1] != turn[: -len(ending)]:
             continue
         position, rotation = folder.matrix(episode, key), folder.matrix(episode, other)
         if arm_of(key) != arm_of(other) or position.shape[1] != len(POSITION):
