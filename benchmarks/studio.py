@@ -126,7 +126,7 @@ def latencies(page: Page) -> list[float]:
     def take(event: dict[str, Any]) -> None:
         client.send("Page.screencastFrameAck", {"sessionId": event["sessionId"]})
         picture = Image.open(io.BytesIO(base64.b64decode(event["data"]))).convert("L")
-        frames.append((event["metadata"]["timestamp"], np.asarray(picture, dtype=int)[:, : picture.width // 2]))
+        frames.append((event["metadata"]["timestamp"], np.asarray(picture, dtype=np.int16)[:, : picture.width // 2]))
 
     client.on("Page.screencastFrame", take)
     client.send("Page.startScreencast", {"format": "jpeg", "quality": 60, "everyNthFrame": 1})

@@ -298,17 +298,18 @@ def lerobot_folder(path, names, state_of, depth=True, key="observation.state"):
 
 
 def add_features(path, values_of, dtype="float32"):
-    """Add features, or replace them, with the values ``(T,)`` or ``(T, 1)`` that functions make of a demonstration."""
+    """Add features, or replace them, with the values ``(T,)`` or ``(T, D)`` that functions make of a demonstration."""
     file = path / "data/chunk-000/file-000.parquet"
     table, info = pq.read_table(file), json.loads((path / "meta/info.json").read_text())
     for key, values in values_of.items():
-        rows = np.concatenate(
-            [np.ravel(values(demonstration(seed, steps=length))) for seed, length in ((0, 20), (1, 30))]
-        )
+        rows = np.concatenate([values(demonstration(seed, steps=length)) for seed, length in ((0, 20), (1, 30))])
+        width = int(rows.size / len(rows))
+        rows = np.ravel(rows).tolist() if width == 1 else rows.tolist()
         if key in table.column_names:
             table = table.drop_columns([key])
-        table = table.append_column(key, pa.array(rows, pa.float64() if dtype == "float64" else pa.float32()))
-        info["features"][key] = {"dtype": dtype, "shape": [1], "names": None}
+        kind = pa.float64() if dtype == "float64" else pa.float32()
+        table = table.append_column(key, pa.array(rows, kind if width == 1 else pa.list_(kind)))
+        info["features"][key] = {"dtype": dtype, "shape": [width], "names": None}
     pq.write_table(table, file)
     (path / "meta/info.json").write_text(json.dumps(info))
 
@@ -521,6 +522,54 @@ def test_poses_without_names_are_read_as_is_usual_for_their_feature(tmp_path, ke
     for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
         expected = tilted(demonstration(seed, steps=len(demo.trajectory)))
         np.testing.assert_allclose(demonstration_poses(demo), expected, atol=1e-5)
+
+
+def in_two_features(path, rotation, **features):
+    """A dataset of joints, a gripper, and ``features``: slices of the pose, or slices with an offset."""
+    lerobot_folder(path, ["joint_1", "joint_2"], lambda demo: np.zeros((len(demo.trajectory), 2)))
+    pose = layout(rotation, gripper=False)
+    parts = {key: value if isinstance(value, tuple) else (value, 0.0) for key, value in features.items()}
+    values = {
+        f"observation.{key}": lambda demo, own=own, offset=offset: pose(demo)[:, own] + offset
+        for key, (own, offset) in parts.items()
+    }
+    add_features(path, values | {"observation.gripper": lambda demo: 100 * (1 - demo.trajectory.gripper_state)})
+    return path
+
+
+PLACE, TURN = slice(0, 3), slice(3, None)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "features"),
+    [
+        (xyzw, {"cube_pos": (PLACE, 1.0), "cube_quat": TURN, "ee_pos": PLACE, "ee_quat": TURN}),
+        (rpy, {"ee_position": PLACE, "ee_euler": TURN, "joint_pos": (PLACE, 1.0)}),
+        (rotvec, {"eef.left_xyz": PLACE, "eef.left_axis_angle": TURN}),
+    ],
+)
+def test_position_and_rotation_of_a_gripper_may_be_features_of_their_own(tmp_path, rotation, features):
+    path = in_two_features(tmp_path / "theirs", rotation, **features)
+    add_features(path, {"action.ee_pose": lambda demo: layout(xyzw, gripper=False)(demo) + 1})  # commanded: comes last
+    for seed, demo in enumerate(import_demonstrations(path, TASK, known_rig())):
+        expected = tilted(demonstration(seed, steps=len(demo.trajectory)))
+        np.testing.assert_allclose(demonstration_poses(demo), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "features", "facts", "said"),
+    [
+        (xyzw, {"camera_pos": PLACE, "camera_quat": TURN}, {}, "poses"),
+        (xyzw, {"delta_ee_pos": PLACE, "delta_ee_quat": TURN}, {}, "poses"),
+        (xyzw, {"ee_pos": PLACE, "ee_vel_quat": TURN}, {}, "poses"),
+        (xyzw, {"ee_pos": PLACE, "ee_quat": TURN}, {"rotation": "rpy"}, "poses"),
+        (xyzw, {"ee_pos": PLACE, "ee_euler": TURN}, {}, "poses"),
+        (xyzw, {"left_ee_pos": PLACE, "left_ee_quat": TURN, "right_ee_pos": PLACE}, {}, "right_ee_pos has no rotation"),
+    ],
+)
+def test_what_is_no_pair_of_a_grippers_position_and_rotation_is_refused(tmp_path, rotation, features, facts, said):
+    path = in_two_features(tmp_path / "theirs", rotation, **features)
+    assert said in refusal(import_demonstrations, path, TASK, known_rig(**facts))
 
 
 def test_a_pose_without_names_may_end_with_the_gripper(tmp_path):

@@ -99,7 +99,7 @@ class Gello(Hand):
 def test_a_guided_calibration_finds_order_signs_and_offsets(cell, tmp_path):
     cell.hand = Gello(PARK)
     bus = ServoBus(SharedTwin(cell.hand), 0, TRAVEL)
-    table = {"port": bus.options["port"], "servos": [1, 2, 4, 6, 7, 8, 9], "baud": 1_000_000, "calibration": "l.toml"}
+    table = {**bus.options, "servos": [1, 2, 4, 6, 7, 8, 9], "baud": 1_000_000, "calibration": "l.toml"}
     arm = replace(cell.config.arms[0], leader=DeviceConfig("gello", table, "cell.toml: leader"))
     rng = np.random.default_rng(0)
 

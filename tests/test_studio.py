@@ -28,7 +28,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 KEYS = {"x": "lj", "y": "ik", "z": "uo"}  # forward and back
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0  # of a busy machine
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium; run: make setup (Debian), or install one")
 
@@ -199,7 +199,7 @@ def test_a_demonstration_by_keys_is_kept_like_any_other(studio):
         wait_until(lambda: np.linalg.norm(studio.tool() - target) < 0.012, f"the gripper is at {target}")
 
     studio.press("Space")
-    go(cube + np.array([-0.085, 0, 0.1]), "zyx")
+    go(cube + np.array([-0.085, 0, 0.1]), "xyz")  # along x first: close to its base the arm would fold up
     go(cube + np.array([-0.085, 0, -0.005]), "z")
     go(goal * [1, 1, 0] + np.array([-0.02, 0, 0.015]), "x")
     studio.banner("Press Enter")

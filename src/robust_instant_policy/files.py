@@ -26,7 +26,7 @@ KINDS = {
     stat.S_IFBLK: "a device",
     stat.S_IFLNK: "a symbolic link",
 }
-PART_SUFFIX = ".part"  # of hidden files under way; what still bears it was left by a killed process
+PART_SUFFIX = ".part"  # of hidden files under way; a file with it was left by a killed process
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

@@ -6,11 +6,10 @@ import argparse
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import add_method, add_rerun, method_settings, positive
+from robust_instant_policy.commands.options import add_method, add_rerun, positive
+from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.llm import connect
-from robust_instant_policy.policies import RobustInstantPolicy
 from robust_instant_policy.reporting.rerun_log import log_plan, open_recording
 
 
@@ -32,22 +31,8 @@ def run(options: argparse.Namespace) -> int:
     screen = StageConsole()
     observation = Observation.load(options.observation)
     demonstrations = load_demonstrations(options.demos)
-    with screen.stage(f"language model ({options.llm})"):
-        model = connect(options.llm)
-    try:
-        policy = RobustInstantPolicy(
-            model,
-            method_settings(options),
-            num_queries=options.queries,
-            deadline_s=options.deadline,
-            progress=screen.done_so_far,
-        )
-        with screen.stage("keypoints of the demonstrations"):
-            policy.fit(demonstrations)
-        with screen.stage("plan"):
-            plan = policy.plan(observation)
-    finally:
-        model.close()
+    with fitted_policy(options, demonstrations, screen) as policy, screen.stage("plan"):
+        plan = policy.plan(observation)
     plan.save(options.out)
     if options.rerun is not None:
         with open_recording(options.rerun, "plan") as recording:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import RUNS, add_method, method_settings, positive
+from robust_instant_policy.commands.options import RUNS, add_method, positive
+from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import StoppedError, UsageError
 from robust_instant_policy.files import make_folder, write_whole
-from robust_instant_policy.llm import connect
 from robust_instant_policy.motion.arm import Motion
 from robust_instant_policy.motion.guard import plan_guarded
 from robust_instant_policy.policies import RobustInstantPolicy
@@ -99,27 +99,13 @@ class _Planner:
     screen: StageConsole
     demonstrations: Sequence[Demonstration]
     policy: RobustInstantPolicy
-    llm: str
 
     @classmethod
     @contextmanager
     def open(cls, config: CellConfig, options: argparse.Namespace, screen: StageConsole) -> Iterator[_Planner]:
-        """Load the demonstrations and the language model, which is closed with the context."""
         demonstrations = load_demonstrations(options.demos)
-        with screen.stage(f"language model ({options.llm})"):
-            model = connect(options.llm)
-        with closing(model):
-            policy = RobustInstantPolicy(
-                model,
-                method_settings(options),
-                num_queries=options.queries,
-                deadline_s=options.deadline,
-                progress=screen.done_so_far,
-                workspace=config.limits.workspace,
-            )
-            with screen.stage("keypoints of the demonstrations"):
-                policy.fit(demonstrations)
-            yield cls(config, screen, demonstrations, policy, model.name)
+        with fitted_policy(options, demonstrations, screen, config.limits.workspace) as policy:
+            yield cls(config, screen, demonstrations, policy)
 
     def plan(self, seen: Observation, out: Path) -> RunRecord:
         """Plan for what is ``seen``; image, plan and context lie in the run folder ``out`` then."""
@@ -132,7 +118,9 @@ class _Planner:
         for note in plan.notes:
             self.screen.say(f"    {note}")
         task = self.demonstrations[0].task or self.config.name
-        return RunRecord(task, task, None, self.llm, self.policy.name, None, PLANNED, tuple(self.screen.stages))
+        return RunRecord(
+            task, task, None, self.policy.llm.name, self.policy.name, None, PLANNED, tuple(self.screen.stages)
+        )
 
 
 class _Run:

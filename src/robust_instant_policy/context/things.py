@@ -232,13 +232,9 @@ def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) ->
     found = locate(bases, keypoints)
     hinged: list[Thing] = []
     for members in rigid:
-        fits = [
-            (error, hinge, shape)
-            for base in bases
-            if base.members != members
-            for error, hinge, shape in _hinge(base, found[base], keypoints[:, list(members)])
-            if error < tolerance
-        ]
+        points = keypoints[:, list(members)]
+        found_axes = [_hinge(base, found[base], points) for base in bases if base.members != members]
+        fits = [fit for fit in found_axes if fit is not None and fit[0] < tolerance]
         if fits:
             _, hinge, shape = min(fits, key=lambda fit: fit[0])
             for share in (1.0, 0.25, 0.5, 0.75):
@@ -246,15 +242,15 @@ def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) ->
     return hinged
 
 
-def _hinge(base: Thing, base_at: Located, points: FloatArray) -> list[tuple[float, Hinge, FloatArray]]:
+def _hinge(base: Thing, base_at: Located, points: FloatArray) -> tuple[float, Hinge, FloatArray] | None:
     """The error (metres) of a part with ``points (I, N, 3)`` as one that turns about an axis of ``base``, the hinge,
-    and the part's shape about it; none where nothing swings or no axis is in sight.
+    and the part's shape about it; None where nothing swings or no axis is in sight.
 
     Seen from the base, each point moves on a circle in a plane across the axis: a first guess, which is then fitted.
     """
     local = (points - base_at.position[:, None]) @ base_at.rotation
     swings = local - local.mean(axis=0)
-    frame = np.linalg.svd(swings.reshape(-1, 3), full_matrices=False)[2][[0, 1, 2]].T
+    frame = np.linalg.svd(swings.reshape(-1, 3), full_matrices=False)[2].T
     frame[:, 1] *= np.linalg.det(frame)  # right-handed, z along the axis
     circles = local @ frame[:, :2]  # |p|² = 2 p·c + a constant for each point: linear in the centre c
     flat = circles - circles.mean(axis=0)
@@ -262,19 +258,20 @@ def _hinge(base: Thing, base_at: Located, points: FloatArray) -> list[tuple[floa
     centre = np.linalg.lstsq(2 * flat.reshape(-1, 2), (square - square.mean(axis=0)).ravel(), rcond=1e-2)[0]
     guess = frame @ np.append(centre, (local @ frame[:, 2]).mean())
     if _off_axis(local, guess, frame)[0] > RIGID_SPREADS * RIGID_SPREAD_M[1]:
-        return []
+        return None
 
     def residuals(x: FloatArray) -> FloatArray:
         rotation = frame @ Rotation.from_rotvec(x[:3]).as_matrix()
         seen, turned, _ = _about_axis(local, guess + x[3:], rotation)
         rise = float(np.arcsin(min(abs(rotation[2, 2]), 1.0)))
         tilt = min(rise, np.pi / 2 - rise) / LEVEL_RAD if base.kind != "rigid" else 0.0
-        return np.concatenate([((seen - turned) / OUTLIER_M).ravel(), [tilt], 0.01 * x])  # the axis turns in itself
+        # The last term: turning about the axis and moving along it change nothing else.
+        return np.concatenate([((seen - turned) / OUTLIER_M).ravel(), [tilt], 0.01 * x])
 
     x = least_squares(residuals, np.zeros(6), loss="soft_l1", max_nfev=20).x
     hinge = Hinge(base, guess + x[3:], frame @ Rotation.from_rotvec(x[:3]).as_matrix())
     error, turned, angle = _off_axis(local, hinge.point, hinge.rotation)
-    return [(error, hinge, turned[0])] if np.ptp(angle) > LEAST_SWING_RAD else []
+    return (error, hinge, turned[0]) if np.ptp(angle) > LEAST_SWING_RAD else None
 
 
 def _off_axis(local: FloatArray, point: FloatArray, rotation: FloatArray) -> tuple[float, FloatArray, FloatArray]:

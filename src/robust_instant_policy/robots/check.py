@@ -32,7 +32,7 @@ def check_cell(config: CellConfig, say: Callable[[str], object]) -> int:
         except RipError as error:
             say(f"  WRONG {error}")
             bad += 1
-    say("everything is well" if not bad else f"{bad} thing{'s' * (bad > 1)} to mend")
+    say("no problem found" if not bad else f"{bad} problem{'s' * (bad > 1)} to solve")
     return int(bad > 0)
 
 

@@ -82,8 +82,8 @@ def serve(choice: Choice, host: str, port: int) -> None:
 
 @contextlib.contextmanager
 def _stop_by_signal(session: Session) -> Iterator[None]:
-    """Ctrl-C and SIGTERM stop ``session`` once its present work is done: simulators do not bear an exception while
-    they load. The second signal raises `KeyboardInterrupt`."""
+    """Ctrl-C and SIGTERM stop ``session`` once its present work is done: an exception while a simulator
+    loads leaves it half loaded. The second signal raises `KeyboardInterrupt`."""
     numbers = signal.SIGINT, signal.SIGTERM
 
     def stop(*_: object) -> None:

@@ -18,7 +18,7 @@ SETTLE_S = 0.5  # for objects that were moved by hand to come to rest
 GAMMA = 2.2  # of the colours that MuJoCo takes; surfaces have linear ones
 BACKDROP = ("ground", "mat")  # bodies that are not drawn: they hide the table or the page's own floor
 FURNITURE = ("table-workspace", *BACKDROP)
-PAINT_M = 1e-4  # discs that lie on each other by less are drawn APART times farther apart, or a browser mixes them
+PAINT_M = 1e-4  # discs closer than this are drawn APART times farther apart, for the depth buffer of a browser
 APART = 30
 
 

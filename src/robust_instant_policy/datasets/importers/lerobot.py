@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ from robust_instant_policy.datasets.importers.hdf5 import choose_camera
 from robust_instant_policy.datasets.importers.joints import JointModel
 from robust_instant_policy.datasets.importers.layouts import (
     ARMS,
+    NO_POSE,
+    POSITION,
+    ROTATIONS,
     Columns,
     arm_of,
     axis_names,
@@ -40,6 +44,16 @@ from robust_instant_policy.files import excerpt
 from robust_instant_policy.geometry import FloatArray, as_numbers
 
 UNNAMED_POSES = {"cartesian_position": "rpy", "ee_pose": None, "eef_pose": None, "tcp_pose": None}  # and their rotation
+# A position and its rotation in two features: the word before, and the last words of their names, with the rotation
+# that so many numbers are ("" is a quaternion in an unknown order).
+GRIPPERS = ("ee", "eef", "effector", "tcp", "gripper", "tool", "hand")
+POSITION_ENDINGS = ("pos", "position", "xyz", "translation")
+ROTATION_ENDINGS: dict[tuple[str, ...], dict[int, str]] = {
+    **{(word,): {4: ""} for word in ("quat", "quaternion", "rot", "rotation", "ori", "orientation")},
+    **{(word,): {3: "rpy"} for word in ("rpy", "euler")},
+    **{words: {3: "rotvec", 4: "axis_angle"} for words in (("axis", "angle"), ("axisangle",))},
+    ("rotvec",): {3: "rotvec"},
+}
 ADVICE = (
     "A LeRobot dataset names the axes of a pose ee.x, ee.y, ee.z and a rotation (ee.wx …, rx …, roll …, qx … qw), or "
     "the rig says where it is (pose_key, rotation) or how to compute it (joints: urdf, link), and which feature holds "
@@ -126,13 +140,72 @@ def _poses(folder: Folder, episode: int, rig: Rig) -> FloatArray | None:
         names = axis_names(folder.info["features"][key])
         for columns in pose_columns(names, rig.rotation) or _unnamed(folder, key, names, rig):
             arm = columns.arm or arm_of(key)
-            if arm not in arms:
+            if arm not in arms and (arm or not arms):  # an arm that has no name is the only one
                 values = _matrix(folder, episode, key, names)
                 arms[arm] = poses_of(name, values, columns, rig.position_unit_m, rig.rotation_unit_rad, rig.tool)
+        pair = _rotation_for(folder, key, rig)
+        if pair is not None and arm_of(key) not in arms and (arm_of(key) or not arms):
+            other, order, columns = pair
+            values = np.concatenate([folder.matrix(episode, key)[:, order], folder.matrix(episode, other)], axis=1)
+            of_both = f"{name}, {key} with {other}"
+            arms[arm_of(key)] = poses_of(of_both, values, columns, rig.position_unit_m, rig.rotation_unit_rad, rig.tool)
         if {"left", "right"} <= arms.keys() or "" in arms:
             break
+    for key in where:
+        if arms and "" not in arms and arm_of(key) not in arms and _is_gripper_position(folder, key):
+            raise DatasetError(f"{name}: {key} has no rotation of the same name beside it, such as …_quat")
     chosen = [arms[arm] for arm in ARMS if arm in arms] or list(arms.values())
     return np.stack(chosen, axis=1) if chosen else None
+
+
+def _rotation_for(folder: Folder, key: str, rig: Rig) -> tuple[str, list[int], Columns] | None:
+    """The feature with the rotation where ``key`` holds the position of a gripper, such as ``ee_quat`` for ``ee_pos``.
+
+    With it come the columns of x, y, z in ``key``, and where x, y, z and then the columns of the other feature are.
+    None where there is no such pair, or names or widths that are not understood.
+    """
+    features = folder.info["features"]
+    words, order = _words(key), _order(axis_names(features[key]))
+    if not _is_gripper_position(folder, key) or order is None:
+        return None
+    for other, (ending, kinds) in product(_vectors(folder), ROTATION_ENDINGS.items()):
+        if _words(other) != [*words[:-1], *ending] or arm_of(other) != arm_of(key):
+            continue
+        width, names = _width(features[other]), [name.lower() for name in axis_names(features[other])]
+        kind = rig.rotation or kinds.get(width)
+        if kind is None or (kind and ROTATIONS[kind] != width):
+            continue
+        if sorted(names) == ["w", "x", "y", "z"]:
+            names = [f"q{name}" for name in names]
+        found = pose_columns([*POSITION, *names], kind or None)
+        if not found and names in ([], list(POSITION)):
+            columns = unnamed_columns(len(POSITION) + width, kind or None)
+            found = [] if columns is None else [columns]
+        if found:
+            return other, order, found[0]
+    return None
+
+
+def _is_gripper_position(folder: Folder, key: str) -> bool:
+    words = _words(key)
+    named = len(words) > 1 and words[-1] in POSITION_ENDINGS and words[-2] in GRIPPERS and not NO_POSE & set(words)
+    return named and _width(folder.info["features"][key]) == len(POSITION)
+
+
+def _words(key: str) -> list[str]:
+    return [word for word in words_of(key) if word not in ARMS]
+
+
+def _width(feature: Mapping[str, Any]) -> int:
+    return int(np.prod(feature["shape"]))
+
+
+def _order(names: list[str]) -> list[int] | None:
+    """The columns of x, y and z; in this order where there are no names, None where the names are others."""
+    last = [words[-1] if (words := words_of(name)) else "" for name in names]
+    if not last:
+        return [0, 1, 2]
+    return [last.index(axis) for axis in POSITION] if sorted(last) == list(POSITION) else None
 
 
 def _unnamed(folder: Folder, key: str, names: list[str], rig: Rig) -> list[Columns]:
@@ -141,7 +214,7 @@ def _unnamed(folder: Folder, key: str, names: list[str], rig: Rig) -> list[Colum
     usual = next((name for name in UNNAMED_POSES if told.endswith(name)), None)
     if key != rig.pose_key and usual is None:
         return []
-    size = int(np.prod(folder.info["features"][key]["shape"]))
+    size = _width(folder.info["features"][key])
     if len({*map(str.lower, names)} & {"x", "y", "z"}) == 3:  # named, in a way that is not understood
         return []
     columns = unnamed_columns(size, rig.rotation or UNNAMED_POSES.get(usual or ""))

@@ -56,7 +56,7 @@ RUNNING, STOPPED = 2, 1  # runtime states
 NORMAL_BIT, PROTECTIVE_BIT = 0x01, 0x04  # of the safety status
 POWER_BIT, PROGRAM_BIT = 0x01, 0x02  # of the robot status
 # The emulation shares the processor with what uses it: times are longer than a controller's.
-SLACK = 20  # factor of the watchdog's time
+SLACK = 100  # factor of the watchdog's time
 TIMEOUT_S, LATENCY_S = 0.9, 0.1  # of the gripper's answers; of states
 
 
