@@ -250,20 +250,23 @@ def _split(
     in ``views``; None if it is rigid. ``found``: the registrations of the whole.
     """
     motions = [one.pose for one in found]
-    best, split = MIN_GAIN, None
+    best, split = 0.0, None
     for part in candidate_parts(home, piece, views, motions):
         rest_model, part_model = (Model((_template_of(home, piece[which], seed),)) for which in (~part, part))
         pairs = []
         for view, whole in zip(views, found, strict=True):
             rest = register(rest_model.templates, view, near=whole.pose)
-            taken = _explained([rest_model], [rest], [0])
+            # What the rest explains, or may explain: what is now where the part hid it.
+            was_hidden = home.hides(transform_points(invert_pose(rest.pose), view.target[:, :3]))
+            taken = np.concatenate([_explained([rest_model], [rest], [0]), view.target[was_hidden, :3]])
             pairs.append((rest, register(part_model.templates, view, taken, rest.pose, PART_TURNS)))
         fitness = [own.fitness for _, own in pairs]
         if min(fitness) < MIN_FITNESS or np.median(fitness) < MIN_PART_FITNESS:
             continue
-        gained = gain(home.points[piece[part]], views, motions, [own.pose for _, own in pairs])
-        if gained > best:
-            best, split = gained, (piece[~part], piece[part], pairs)
+        share, metres = gain(home.points[piece[part]], views, motions, [own.pose for _, own in pairs])
+        # Not the largest share, which half of the part has as well as all of it.
+        if share > MIN_GAIN and metres > best:
+            best, split = metres, (piece[~part], piece[part], pairs)
     return split
 
 
@@ -276,22 +279,28 @@ def _complete(
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
         better = [k for k in range(len(models)) if found[i][k].score > found[i][number].score]
         taken = _explained(models, found[i], better)
-        grown = replace(model, templates=tuple(templates))
-        registrations[i] = _register_model(grown, views[i], found[i], taken, registrations[i].pose)
-        templates += _another_template(views[i], registrations[i], templates, seed)
+        grown = [*models[:number], replace(model, templates=tuple(templates)), *models[number + 1 :]]
+        registrations[i] = _register_model(grown, number, views[i], found[i], taken, registrations[i].pose)
+        others = _explained(models, found[i], [k for k in range(len(models)) if k != number])
+        templates += _another_template(views[i], registrations[i], templates, others, seed)
     return RigidObject(replace(model, templates=tuple(templates)), tuple(registrations))
 
 
 def _register_model(
-    model: Model,
+    models: Sequence[Model],
+    number: int,
     view: View,
     found: Sequence[Registration] | Mapping[int, Registration],
     taken: FloatArray | None = None,
     near: FloatArray | None = None,
 ) -> Registration:
-    """One object: a part near its parent, which was ``found``, and an object with parts where they fit, too."""
+    """Object ``number``: a part near its parent, which was ``found``, and an object with parts where they fit, too."""
+    model = models[number]
     if model.parent >= 0:
-        return register(model.templates, view, taken, found[model.parent].pose, PART_TURNS)
+        # In one image parts hide some of their parent, in all of them nothing.
+        whole = np.concatenate([template.surface for template in models[model.parent].templates])
+        beside = transform_points(found[model.parent].motion, whole)
+        return register(model.templates, view, taken, found[model.parent].pose, PART_TURNS, beside=beside, start=near)
     if model.family:
         family = register(model.family, view, taken)
         found_in_family = register(model.templates, view, taken, family.pose, FAMILY_TURNS, alone=False)
@@ -308,7 +317,7 @@ def register_all(models: Sequence[Model], view: View) -> list[Registration]:
     """
     found: dict[int, Registration] = {}
     for i in sorted(range(len(models)), key=lambda i: models[i].parent >= 0):  # parts come after their objects
-        found[i] = _register_model(models[i], view, found)
+        found[i] = _register_model(models, i, view, found)
     points = view.target[:, :3].astype(np.float64)
     claims: dict[int, IntArray] = {}  # of those that are settled
     for i in sorted(found, key=lambda i: -found[i].score):
@@ -316,7 +325,7 @@ def register_all(models: Sequence[Model], view: View) -> list[Registration]:
         claimed = _claim(points, models[i], found[i])
         if _shared(claimed, claims.values()) > most:
             contested = found[i]
-            again = _register_model(models[i], view, found, _explained(models, found, list(claims)))
+            again = _register_model(models, i, view, found, _explained(models, found, list(claims)))
             found[i] = max(
                 (_apart(points, models[i], one, claims) for one in (contested, again)), key=lambda r: r.score
             )
@@ -326,7 +335,7 @@ def register_all(models: Sequence[Model], view: View) -> list[Registration]:
                 holder, others = holders[0], {k: claims[k] for k in claims if k != holders[0]}
                 keeping = _apart(points, models[i], contested, others)
                 without_both = _explained(models, found | {i: contested}, [*others, i])
-                moved = _register_model(models[holder], view, found, without_both)
+                moved = _register_model(models, holder, view, found, without_both)
                 if keeping.score + moved.score > found[i].score + found[holder].score:
                     found |= {i: keeping, holder: moved}
                     claims[holder] = _claim(points, models[holder], moved)
@@ -364,12 +373,17 @@ def _apart(points: FloatArray, model: Model, found: Registration, claims: Mappin
     return replace(found, fitness=found.fitness * (1 - _shared(_claim(points, model, found), claims.values())))
 
 
-def _another_template(view: View, found: Registration, templates: Sequence[Template], seed: int) -> list[Template]:
-    """The object as ``view`` shows it, or nothing where it does not."""
+def _another_template(
+    view: View, found: Registration, templates: Sequence[Template], others: FloatArray, seed: int
+) -> list[Template]:
+    """The object as ``view`` shows it, apart from what is nearer to ``others (T, 3)``, or nothing where it does not."""
     to_reference = np.asarray(np.linalg.inv(found.motion), dtype=np.float64)
     known = templates[found.template].xyzrgb
     points = transform_points(to_reference, view.target[:, :3])
-    same = cKDTree(known[:, :3]).query(points)[0] < SAME_OBJECT_M
+    distance = cKDTree(known[:, :3]).query(points)[0]
+    same = distance < SAME_OBJECT_M
+    if len(others):
+        same &= distance <= cKDTree(others).query(view.target[:, :3])[0]
     if not same.any():
         return []
     seen = np.concatenate([points, view.target[:, 3:]], axis=1)[same].astype(np.float32)
@@ -401,11 +415,13 @@ def register(
     near: FloatArray | None = None,
     turns: FloatArray | None = None,
     alone: bool = True,
+    beside: FloatArray | None = None,
+    start: FloatArray | None = None,
 ) -> Registration:
     """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world.
 
     ``near (4, 4)``: another motion to start from. With ``turns (A,)`` it is turned by these, and those from elsewhere
-    are left out; unless ``alone``, all others are.
+    are left out; unless ``alone``, all others are. Matches apart from the points ``beside (B, 3)`` vote once more.
     """
     target, free = view.target, np.arange(len(view.cell_points))
     if taken is not None and len(taken):
@@ -419,9 +435,14 @@ def register(
     motions = np.zeros((0, 4, 4))
     if alone:
         motions = vote_for_motions(points, view.cell_points[free], np.concatenate(with_foreground))
+    if beside is not None and (apart := ~within(view.cell_points[free], beside, CLAIM_M)).any():
+        votes = vote_for_motions(points, view.cell_points[free[apart]], np.concatenate(with_foreground)[:, apart])
+        motions = np.concatenate([motions, votes])
     if near is not None:
         centre = points.mean(axis=0)
         motions = np.concatenate([rotated(near, centre, np.zeros(1) if turns is None else turns), motions])
+        if start is not None:
+            motions = np.concatenate([start[None], motions])
         if turns is not None:
             travel = motions[:, :3, :3] @ centre + motions[:, :3, 3] - transform_points(near, centre)
             motions = motions[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]

@@ -56,12 +56,15 @@ def _connected(home: View, piece: IntArray, which: BoolArray) -> list[BoolArray]
     return parts
 
 
-def gain(points: FloatArray, views: Sequence[View], whole: Sequence[FloatArray], own: Sequence[FloatArray]) -> float:
-    """Share by which the distances of a part's ``points (N, 3)`` from the surfaces in ``views`` become smaller with its
-    ``own`` motions than with those of the ``whole``; 0 where those explain it.
+def gain(
+    points: FloatArray, views: Sequence[View], whole: Sequence[FloatArray], own: Sequence[FloatArray]
+) -> tuple[float, float]:
+    """By how much the distances of a part's ``points (N, 3)`` from the surfaces in ``views`` become smaller with its
+    ``own`` motions than with those of the ``whole``: as a share, 0 where those explain it, and in all, metres.
     """
-    before = _distances(points, views, whole).mean()
-    return 0.0 if before < MIN_DISTANCE_M else 1 - float(_distances(points, views, own).mean() / before)
+    before, after = (_distances(points, views, motions) for motions in (whole, own))
+    share = 0.0 if before.mean() < MIN_DISTANCE_M else 1 - float(after.mean() / before.mean())
+    return share, float((before - after).sum())
 
 
 def _distances(points: FloatArray, views: Sequence[View], poses: Sequence[FloatArray]) -> FloatArray:
