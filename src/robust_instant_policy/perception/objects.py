@@ -39,7 +39,6 @@ SHAPE_REACH_M = 0.03  # from an object: greatest distance of points of a larger 
 SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
 MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
 PART_TURNS = np.deg2rad(np.arange(-60.0, 90.0, 30.0))  # of a part against its object
-FAMILY_TURNS = np.zeros(1)  # of an object against itself with its parts
 MUCH_BETTER = 0.05  # of the score, by which an object's own registration overrules that with its parts
 MAX_PART_TRAVEL_M = 0.2
 TOUCH_M = 0.03
@@ -69,6 +68,7 @@ class Registration:
         return (self.fitness + self.similarity) / 2
 
 
+NO_MOTIONS = np.zeros((0, 4, 4))
 IN_REFERENCE = Registration(np.eye(4), 1.0, 1.0, 0)
 
 
@@ -255,11 +255,11 @@ def _split(
         rest_model, part_model = (Model((_template_of(home, piece[which], seed),)) for which in (~part, part))
         pairs = []
         for view, whole in zip(views, found, strict=True):
-            rest = register(rest_model.templates, view, near=whole.pose)
+            rest = register(rest_model.templates, view, starts=whole.pose[None])
             # What the rest explains, or may explain: what is now where the part hid it.
             was_hidden = home.hides(transform_points(invert_pose(rest.pose), view.target[:, :3]))
             taken = np.concatenate([_explained([rest_model], [rest], [0]), view.target[was_hidden, :3]])
-            pairs.append((rest, register(part_model.templates, view, taken, rest.pose, PART_TURNS)))
+            pairs.append((rest, register(part_model.templates, view, taken, parent=rest.pose)))
         fitness = [own.fitness for _, own in pairs]
         if min(fitness) < MIN_FITNESS or np.median(fitness) < MIN_PART_FITNESS:
             continue
@@ -280,7 +280,7 @@ def _complete(
         better = [k for k in range(len(models)) if found[i][k].score > found[i][number].score]
         taken = _explained(models, found[i], better)
         grown = [*models[:number], replace(model, templates=tuple(templates)), *models[number + 1 :]]
-        registrations[i] = _register_model(grown, number, views[i], found[i], taken, registrations[i].pose)
+        registrations[i] = _register_model(grown, number, views[i], found[i], taken, registrations[i].pose[None])
         others = _explained(models, found[i], [k for k in range(len(models)) if k != number])
         templates += _another_template(views[i], registrations[i], templates, others, seed)
     return RigidObject(replace(model, templates=tuple(templates)), tuple(registrations))
@@ -292,21 +292,22 @@ def _register_model(
     view: View,
     found: Sequence[Registration] | Mapping[int, Registration],
     taken: FloatArray | None = None,
-    near: FloatArray | None = None,
+    starts: FloatArray = NO_MOTIONS,
 ) -> Registration:
     """Object ``number``: a part near its parent, which was ``found``, and an object with parts where they fit, too."""
     model = models[number]
     if model.parent >= 0:
-        # In one image parts hide some of their parent, in all of them nothing.
+        parent = found[model.parent]
+        # In one image parts hide some of their object, in all of them nothing.
         whole = np.concatenate([template.surface for template in models[model.parent].templates])
-        beside = transform_points(found[model.parent].motion, whole)
-        return register(model.templates, view, taken, found[model.parent].pose, PART_TURNS, beside=beside, start=near)
-    if model.family:
-        family = register(model.family, view, taken)
-        found_in_family = register(model.templates, view, taken, family.pose, FAMILY_TURNS, alone=False)
-        found_alone = register(model.templates, view, taken, near)
-        return found_alone if found_alone.score > found_in_family.score + MUCH_BETTER else found_in_family
-    return register(model.templates, view, taken, near)
+        beside = transform_points(parent.motion, whole)
+        return register(model.templates, view, taken, starts, parent=parent.pose, beside=beside)
+    alone = register(model.templates, view, taken, starts)
+    if not model.family:
+        return alone
+    family = register(model.family, view, taken)
+    in_family = register(model.templates, view, taken, family.pose[None], vote=False)
+    return alone if alone.score > in_family.score + MUCH_BETTER else in_family
 
 
 def register_all(models: Sequence[Model], view: View) -> list[Registration]:
@@ -412,16 +413,16 @@ def register(
     templates: Sequence[Template],
     view: View,
     taken: FloatArray | None = None,
-    near: FloatArray | None = None,
-    turns: FloatArray | None = None,
-    alone: bool = True,
+    starts: FloatArray = NO_MOTIONS,
+    vote: bool = True,
+    parent: FloatArray | None = None,
     beside: FloatArray | None = None,
-    start: FloatArray | None = None,
 ) -> Registration:
     """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world.
 
-    ``near (4, 4)``: another motion to start from. With ``turns (A,)`` it is turned by these, and those from elsewhere
-    are left out; unless ``alone``, all others are. Matches apart from the points ``beside (B, 3)`` vote once more.
+    From the motions ``starts (S, 4, 4)``, and unless ``vote`` is false from those of matches. A part also starts from
+    turns of the pose ``parent (4, 4)`` of its object, and from matches apart from that object's points
+    ``beside (B, 3)``, and stays near it.
     """
     target, free = view.target, np.arange(len(view.cell_points))
     if taken is not None and len(taken):
@@ -431,26 +432,25 @@ def register(
             return Registration(np.eye(4), 0.0, 0.0, 0)
     similar = _similarities(templates, view)
     with_foreground = [table[:, free] for table in similar]
+    matches, goals = np.concatenate(with_foreground), view.cell_points[free]
     points = np.concatenate([template.points for template in templates])
-    motions = np.zeros((0, 4, 4))
-    if alone:
-        motions = vote_for_motions(points, view.cell_points[free], np.concatenate(with_foreground))
-    if beside is not None and (apart := ~within(view.cell_points[free], beside, CLAIM_M)).any():
-        votes = vote_for_motions(points, view.cell_points[free[apart]], np.concatenate(with_foreground)[:, apart])
-        motions = np.concatenate([motions, votes])
-    if near is not None:
-        centre = points.mean(axis=0)
-        motions = np.concatenate([rotated(near, centre, np.zeros(1) if turns is None else turns), motions])
-        if start is not None:
-            motions = np.concatenate([start[None], motions])
-        if turns is not None:
-            travel = motions[:, :3, :3] @ centre + motions[:, :3, 3] - transform_points(near, centre)
-            motions = motions[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
+    centre = points.mean(axis=0)
+    motions = [starts]
+    if parent is not None:
+        motions.append(rotated(parent, centre, PART_TURNS))
+    if vote:
+        motions.append(vote_for_motions(points, goals, matches))
+    if beside is not None and (apart := ~within(goals, beside, CLAIM_M)).any():
+        motions.append(vote_for_motions(points, goals[apart], matches[:, apart]))
+    candidates = np.concatenate(motions)
+    if parent is not None:
+        travel = candidates[:, :3, :3] @ centre + candidates[:, :3, 3] - transform_points(parent, centre)
+        candidates = candidates[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
     index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
     source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
-    candidates = refine(motions, source, target, similarity, view.hides)
-    pose = settle_turn(candidates.motions[0], source, target, similarity, view.hides)
-    return Registration(pose, float(candidates.fitness[0]), float(candidates.similarity[0]), index)
+    refined = refine(candidates, source, target, similarity, view.hides)
+    pose = settle_turn(refined.motions[0], source, target, similarity, view.hides)
+    return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index)
 
 
 def certainty(model: Model, found: Registration, view: View, points: FloatArray) -> FloatArray:
