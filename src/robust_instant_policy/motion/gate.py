@@ -103,7 +103,8 @@ class Gate:
         """What the arms may do towards ``wanted``: within speeds, accelerations and ranges, or not at all.
 
         Where the next step, or coming to rest after it, would bring a tool out of the workspace or a link to the table,
-        to another link or to the other arm, all arms brake. A tool that is outside the workspace comes nearer to it or stays.
+        to another link or to the other arm, all arms brake. A tool that is outside the workspace comes nearer to it or
+        stays.
         """
         last = np.stack([command.joints for command in self._last])
         joints = np.stack([command.joints for command in wanted])

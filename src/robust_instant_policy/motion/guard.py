@@ -124,9 +124,7 @@ class Space:
         self._shapes = [ArmShape(arm.kinematics) for arm in arms]
         self._parked = [shape.at(arm.home) for shape, arm in zip(self._shapes, arms, strict=True)]
 
-    def check(
-        self, joints: FloatArray, rate_hz: float, to_home: bool = False, start: FloatArray | None = None
-    ) -> None:
+    def check(self, joints: FloatArray, rate_hz: float, to_home: bool = False, start: FloatArray | None = None) -> None:
         """Refuse ``joints (N, A, J)`` with a tool outside the workspace, a link at the table, or two arms or two links
         of one arm together.
 
