@@ -29,7 +29,7 @@ from PIL import Image
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import RipError, RobotError
+from robust_instant_policy.errors import DatasetError, RipError, RobotError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.network import is_loopback
 from robust_instant_policy.perception import KeypointExtractor
@@ -165,18 +165,20 @@ class _Page:
         """Mark the keypoints of the demonstrations so far in a start image, or say why there are none."""
         try:
             recorded = load_demonstrations(self._demos)
+        except DatasetError:
+            self.start = picture(seen.rgb, "start image; its keypoints are shown once there is a demonstration")
+            return
+        try:
             extractor = KeypointExtractor(workspace=self._workspace)
             extractor.fit([one.observation for one in recorded], [one.trajectory for one in recorded])
             located = extractor.locate(seen)
         except RipError as error:  # too few demonstrations so far, too little in common, or a missing package
             self.start = picture(seen.rgb, f"start image; no keypoints yet: {error}")
             return
-        words = f"start image, keypoints of {len(recorded)} demonstrations, confidence {located.confidence.min():.2f}"
-        self.start = picture(
-            seen.rgb,
-            "; ".join((f"{words} to {located.confidence.max():.2f}", *located.notes)),
-            marks=keypoint_marks(located.pixels, located.confidence),
-        )
+        low, high = located.confidence.min(), located.confidence.max()
+        words = f"start image with the keypoints of the demonstrations so far ({len(recorded)}), confidence"
+        caption = "; ".join((f"{words} {low:.2f} to {high:.2f}", *located.notes))
+        self.start = picture(seen.rgb, caption, marks=keypoint_marks(located.pixels, located.confidence))
 
 
 def _handler(page: _Page) -> type[BaseHTTPRequestHandler]:
