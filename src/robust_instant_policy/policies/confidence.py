@@ -4,8 +4,9 @@
 
 The features f_j are made from `Evidence` and are 0 where nothing speaks against the plan; the coefficients were fitted
 to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A
-plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, or the
-checks could not decide whether images and paths belong together, it is at most `UNKNOWN`.
+plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, a thing
+has another shape than theirs, or the checks could not decide whether images and paths belong together, it is at most
+`UNKNOWN`.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ UNDECIDED_NOTE = (
     "unchecked: it could not be decided whether images and paths of the demonstrations belong together; "
     f"the confidence is at most {UNKNOWN}"
 )
+
+DISTORTED = 3.0  # `Evidence.distortion` above which a thing is another one than was demonstrated, or found wrongly
 
 RECOGNISED = 0.8  # of the least confidence among demonstrations, from which on a scene counts as recognised
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
@@ -80,8 +83,16 @@ class Evidence:
     @property
     def unknown_notes(self) -> tuple[str, ...]:
         """Why nothing is known of the plan's chance; empty where something is."""
-        predicted = np.isfinite(self.prediction) and np.isfinite(self.novelty)
-        return (*(() if predicted else (UNKNOWN_NOTE,)), *((UNDECIDED_NOTE,) if self.undecided > 0 else ()))
+        distorted = (
+            f"warning: the keypoints of a thing lie {self.distortion:.1f} times farther from its demonstrated shape "
+            f"than usual ({DISTORTED:.0f} are accepted): is it another thing? the confidence is at most {UNKNOWN}"
+        )
+        reasons = {
+            UNKNOWN_NOTE: not (np.isfinite(self.prediction) and np.isfinite(self.novelty)),
+            UNDECIDED_NOTE: self.undecided > 0,
+            distorted: self.distortion > DISTORTED,
+        }
+        return tuple(note for note, holds in reasons.items() if holds)
 
     @property
     def displacement_note(self) -> str:
