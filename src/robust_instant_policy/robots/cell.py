@@ -296,6 +296,11 @@ def _arm(section: Section, path: Path) -> ArmConfig:
     gripper = tool = None
     if "gripper" in section:
         file = path.parent / section.text("gripper")
+        if not file.exists():
+            raise section.error(
+                "gripper", f"names {file}, which is not there: take it out until rip calibrate tool has written it; an "
+                "arm of your own needs length and opening, metres, by a ruler first"
+            )  # fmt: skip
         gripper, tool = read_gripper(file), read_tool(file)
     config = ArmConfig(
         name=name,
