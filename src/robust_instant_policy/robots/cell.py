@@ -297,10 +297,10 @@ def _arm(section: Section, path: Path) -> ArmConfig:
     if "gripper" in section:
         file = path.parent / section.text("gripper")
         if not file.exists():
-            raise section.error(
-                "gripper", f"names {file}, which is not there: take it out until rip calibrate tool has written it; an "
-                "arm of your own needs length and opening, metres, by a ruler first"
-            )  # fmt: skip
+            words = (
+                "take the key out until rip calibrate tool has written it; an arm of your own needs length and opening"
+            )
+            raise section.error("gripper", f"is wrong, there is no file at {file}: {words}, metres, by a ruler first")
         gripper, tool = read_gripper(file), read_tool(file)
     config = ArmConfig(
         name=name,

@@ -84,13 +84,11 @@ def arm_of(config: ArmConfig, folder: Path = Path()) -> Arm:
             _move_tool(spec.body(TOOL), config.tool)
         compiled = spec.compile()
         compiled.body(TOOL)
-        if not compiled.ngeom:
-            raise ValueError("its links have no collision shapes")
     except (ValueError, KeyError, AttributeError) as error:
         words = " ".join(str(error).split())
-        raise CellError(
-            f"{model.urdf} cannot be used: {words}; it needs collision shapes and a link called {TOOL}"
-        ) from None
+        raise CellError(f"{model.urdf} cannot be used: {words}; it needs a link called {TOOL}") from None
+    if not compiled.ngeom:
+        raise CellError(f"{model.urdf} has no collision shapes, without which links cannot be kept apart; add them")
     count = len(config.park)
     revolute = int(np.cumprod(compiled.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).sum())
     if count == 0 or count > revolute or (config.model in KNOWN and count != revolute):
