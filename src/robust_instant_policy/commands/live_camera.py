@@ -107,7 +107,7 @@ class LiveCamera:
 def _serve(
     wire: Connection, device: tuple[str, Mapping[str, Any], str], folder: Path, demos: Path, workspace: FloatArray
 ) -> None:
-    """Read the camera and show it until ``wire`` is closed. What is no number or frame on it is an error's words."""
+    """Read the camera and show it until ``wire`` is closed; a text sent over it is an error's message."""
     for number in (signal.SIGINT, signal.SIGHUP):  # the recording process stops the arms first
         signal.signal(number, signal.SIG_IGN)
     os.nice(NICE)
