@@ -93,6 +93,14 @@ class ArmShape:
         ends = transform_points(self._base, ends)
         return Capsules(ends[:, :, 0], ends[:, :, 1], self.radius)
 
+    def height(self, links: Capsules) -> FloatArray:
+        """Height ``(N,)`` above the table of the lowest of ``links`` that moves, metres.
+
+        A hand works at the table, where its fingertips are checked: of its other parts the axes count.
+        """
+        heights: FloatArray = (links.lowest() + np.where(self.hand, links.radius, 0.0))[:, self.near_table].min(axis=1)
+        return heights
+
 
 def _joints_above(model: mujoco.MjModel, body: int, num_joints: int) -> int:
     """How many of the arm's joints move ``body``."""

@@ -139,9 +139,7 @@ class Space:
             what = "a fingertip goes"
             _refuse(depth - limits.table_depth, depth, limits.table_depth, arm, what, "m below the table",
                     "table_depth", rate_hz)  # fmt: skip
-            # A hand works at the table, where its fingertips were checked; of its other parts the axes stay above it.
-            height = links.lowest() + np.where(shape.hand, links.radius, 0.0)
-            least = height[:, shape.near_table].min(axis=1)
+            least = shape.height(links)
             _refuse(-least, least, 0.0, arm, "a link has a height above the table of", "m", "model", rate_hz)
         for one, other in combinations(range(len(self._arms)), 2):
             apart = capsules[one].distances(capsules[other])

@@ -10,12 +10,14 @@ from scipy.spatial.transform import Rotation
 from robust_instant_policy.errors import UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
+from robust_instant_policy.motion.capsules import ArmShape
 from robust_instant_policy.motion.waypoints import plan_onward
 from robust_instant_policy.trajectory import Trajectory
 
 RESPONSE_S = 0.08  # time constant with which the gripper closes in on its target
 TURN_SPEED_RAD_S = 2.0
 ARRIVED_M, ARRIVED_RAD = 2e-4, 2e-3
+LINK_M = 0.005  # by which the capsule around a link may enter the table: it is larger than the link
 
 
 class Follower:
@@ -24,14 +26,14 @@ class Follower:
     def __init__(self, arms: Sequence[Arm], control_hz: float):
         self.arms, self.control_hz = arms, control_hz
         self.motion = Motion.at_home(arms)
-        self._refused: tuple[FloatArray, np.ndarray, str] | None = (
-            None  # of the last targets, no part of whose way is free
-        )
+        self._refused: tuple[FloatArray, np.ndarray, str] | None = None  # the last targets, where no way is free
+        self._shapes = [ArmShape(arm.kinematics) for arm in arms]
+        self._height = self._heights(self.motion)
         self._speed = min(arm.tool_speed for arm in arms) / 2  # that of `plan_onward`
 
     def resume(self, motion: Motion) -> None:
         """Go on from the end of ``motion``."""
-        self.motion, self._refused = motion, None
+        self.motion, self._refused, self._height = motion, None, self._heights(motion)
 
     def towards(self, targets: FloatArray, closed: np.ndarray) -> tuple[Motion | None, str]:
         """The next motion towards ``targets (A, 4, 4)`` with gripper states ``closed (A,)`` bool.
@@ -71,8 +73,17 @@ class Follower:
 
     def _plan(self, poses: FloatArray, closed: np.ndarray) -> Motion:
         actions = Trajectory.from_poses(poses[None], closed[None], self.arms[0].triangle).actions
-        self.motion = plan_onward(actions, self.control_hz, self.motion, self.arms, self.control_hz)
-        return self.motion
+        motion = plan_onward(actions, self.control_hz, self.motion, self.arms, self.control_hz)
+        height = self._heights(motion)
+        if (height < np.minimum(self._height, -LINK_M)).any():
+            raise UnreachableError("the arm would touch the table with a link")
+        self.motion, self._height = motion, height
+        return motion
+
+    def _heights(self, motion: Motion) -> FloatArray:
+        """Height ``(A,)`` of each arm's lowest link above the table at the end of ``motion``, metres."""
+        ends = zip(self._shapes, motion.joints[-1], strict=True)
+        return np.concatenate([shape.height(shape.at(joints)) for shape, joints in ends])
 
     def _step(self, here: FloatArray, target: FloatArray) -> FloatArray:
         """The pose one control step from ``here`` towards ``target (4, 4)``."""

@@ -42,6 +42,8 @@ HOW_TO = """
 3. Once the task is done, **Enter** keeps the demonstration; the next scene comes.
 
 **Z** goes back one second, **X** begins again. **I J K L** shift, **U O** up and down, **N M** turn.
+
+The arm stops at the table, but not at the objects: a link may push one.
 """
 
 
