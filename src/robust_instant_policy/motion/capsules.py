@@ -98,8 +98,15 @@ class ArmShape:
 
         A hand works at the table, where its fingertips are checked: of its other parts the axes count.
         """
-        heights: FloatArray = (links.lowest() + np.where(self.hand, links.radius, 0.0))[:, self.near_table].min(axis=1)
-        return heights
+        height: FloatArray = (links.lowest() + np.where(self.hand, links.radius, 0.0))[:, self.near_table].min(axis=1)
+        return height
+
+    def distance(self, links: Capsules, other: ArmShape, others: Capsules) -> FloatArray:
+        """Distance ``(N,)`` of ``links`` from the links ``others`` of an arm with the shape ``other``, metres."""
+        apart = links.distances(others)
+        apart[:, self.fixed[:, None] & other.fixed] = np.inf  # nothing moves there
+        nearest: FloatArray = apart.min(axis=(1, 2))
+        return nearest
 
 
 def _joints_above(model: mujoco.MjModel, body: int, num_joints: int) -> int:

@@ -142,9 +142,7 @@ class Space:
             least = shape.height(links)
             _refuse(-least, least, 0.0, arm, "a link has a height above the table of", "m", "model", rate_hz)
         for one, other in combinations(range(len(self._arms)), 2):
-            apart = capsules[one].distances(capsules[other])
-            apart[:, self._shapes[one].fixed[:, None] & self._shapes[other].fixed] = np.inf  # nothing moves there
-            apart = apart.min(axis=(1, 2))
+            apart = self._shapes[one].distance(capsules[one], self._shapes[other], capsules[other])
             what = f"its distance from {self._arms[other].name} is"
             _refuse(limits.arm_distance - apart, apart, limits.arm_distance, self._arms[one], what, "m",
                     "arm_distance", rate_hz)  # fmt: skip

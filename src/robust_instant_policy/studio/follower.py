@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,7 +18,7 @@ from robust_instant_policy.trajectory import Trajectory
 RESPONSE_S = 0.08  # time constant with which the gripper closes in on its target
 TURN_SPEED_RAD_S = 2.0
 ARRIVED_M, ARRIVED_RAD = 2e-4, 2e-3
-LINK_M = 0.005  # by which the capsule around a link may enter the table: it is larger than the link
+LINK_M = 0.005  # by which capsules around links may enter the table, or each other: they are larger than the links
 
 
 class Follower:
@@ -28,12 +29,12 @@ class Follower:
         self.motion = Motion.at_home(arms)
         self._refused: tuple[FloatArray, np.ndarray, str] | None = None  # the last targets, where no way is free
         self._shapes = [ArmShape(arm.kinematics) for arm in arms]
-        self._height = self._heights(self.motion)
+        self._room = self._room_after(self.motion)
         self._speed = min(arm.tool_speed for arm in arms) / 2  # that of `plan_onward`
 
     def resume(self, motion: Motion) -> None:
         """Go on from the end of ``motion``."""
-        self.motion, self._refused, self._height = motion, None, self._heights(motion)
+        self.motion, self._refused, self._room = motion, None, self._room_after(motion)
 
     def towards(self, targets: FloatArray, closed: np.ndarray) -> tuple[Motion | None, str]:
         """The next motion towards ``targets (A, 4, 4)`` with gripper states ``closed (A,)`` bool.
@@ -74,16 +75,21 @@ class Follower:
     def _plan(self, poses: FloatArray, closed: np.ndarray) -> Motion:
         actions = Trajectory.from_poses(poses[None], closed[None], self.arms[0].triangle).actions
         motion = plan_onward(actions, self.control_hz, self.motion, self.arms, self.control_hz)
-        height = self._heights(motion)
-        if (height < np.minimum(self._height, -LINK_M)).any():
-            raise UnreachableError("the arm would touch the table with a link")
-        self.motion, self._height = motion, height
+        room = self._room_after(motion)
+        if (closer := room < np.minimum(self._room, -LINK_M)).any():
+            what = "the table" if closer[: len(self.arms)].any() else "the other arm"
+            raise UnreachableError(f"a link of the arm would touch {what}")
+        self.motion, self._room = motion, room
         return motion
 
-    def _heights(self, motion: Motion) -> FloatArray:
-        """Height ``(A,)`` of each arm's lowest link above the table at the end of ``motion``, metres."""
-        ends = zip(self._shapes, motion.joints[-1], strict=True)
-        return np.concatenate([shape.height(shape.at(joints)) for shape, joints in ends])
+    def _room_after(self, motion: Motion) -> FloatArray:
+        """Distances, metres, of each arm's links from the table, and of each pair of arms, at the end of ``motion``."""
+        shapes = self._shapes
+        links = [shape.at(joints) for shape, joints in zip(shapes, motion.joints[-1], strict=True)]
+        heights = [shape.height(own) for shape, own in zip(shapes, links, strict=True)]
+        pairs = combinations(range(len(shapes)), 2)
+        apart = [shapes[one].distance(links[one], shapes[other], links[other]) for one, other in pairs]
+        return np.concatenate(heights + apart)
 
     def _step(self, here: FloatArray, target: FloatArray) -> FloatArray:
         """The pose one control step from ``here`` towards ``target (4, 4)``."""

@@ -204,7 +204,7 @@ class Page:
             self.demonstrations = stored_demonstrations(folder, task, MANY) if folder.exists() else []
             self._count()
             cell = self._make_cell(task, self.demonstrations)
-            for control in self._with_arms:
+            for control in (*self._with_arms, *self._acts.with_arms):
                 control.visible = bool(cell.arms)
             self.session.open(cell)
             self._new_scene()
