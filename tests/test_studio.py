@@ -174,7 +174,7 @@ def test_what_the_arm_cannot_reach_is_said_and_not_jumped_to(studio):
     studio.banner("Your turn")
     lying = studio.ask(lambda one: one.cell.tool_poses()[0])
     lying[:3, :3] = Rotation.from_euler("x", 90, degrees=True).as_matrix() @ lying[:3, :3]
-    lying[2, 3] = 0.02
+    lying[:3, 3] = 0.0, 0.2, 0.02
     studio.session.post(lambda: studio.session.aim(0, lying))
     studio.banner("a link of the arm would touch the table")
     studio.press("x")
