@@ -38,7 +38,7 @@ from stand_in import StandIn
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError, PlanningError, RipError
-from robust_instant_policy.evaluation.statistics import wilson_interval
+from robust_instant_policy.evaluation.statistics import auroc, wilson_interval
 from robust_instant_policy.policies import RobustInstantPolicy
 from robust_instant_policy.policies.confidence import COEFFICIENTS, GOOD_AGREEMENT, Evidence, plan_confidence
 from robust_instant_policy.policies.context import locate
@@ -247,12 +247,6 @@ def fit(options: argparse.Namespace) -> None:
     without = {task: solve(tasks != task) for task in sorted(set(tasks) - {RELATIONS})}
     print("each task with the coefficients that the others give:")
     print(table({"all": all_rows(options.folder, "tune")}, without))
-
-
-def auroc(confidence: np.ndarray, right: np.ndarray) -> float:
-    """Probability that a success has more confidence than a failure; ties count half."""
-    good, bad = confidence[right][:, None], confidence[~right]
-    return float(((good > bad) + 0.5 * (good == bad)).mean()) if good.size and bad.size else float("nan")
 
 
 def summary(rows: Sequence[Row], of_tasks: Mapping[str, Coefficients]) -> dict[str, str]:

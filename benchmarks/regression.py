@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 from contaminated_trajectories import KINDS, STEPS, Scene, draw_modes, draw_scene, draw_single_steps
-from scipy.stats import rankdata
 
+from robust_instant_policy.evaluation.statistics import auroc
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression import (
     StudentTMixture,
@@ -160,11 +160,6 @@ def measure_single_steps(job: tuple[str, float, int]) -> dict[str, float]:
     return {name: float((error > TOLERANCE_M).mean()) for name, error in errors.items()}
 
 
-def auroc(positive: FloatArray, negative: FloatArray) -> float:
-    ranks = rankdata(np.concatenate([positive, negative]))[: len(positive)]
-    return (ranks.sum() - len(positive) * (len(positive) + 1) / 2) / (len(positive) * len(negative))
-
-
 def table(header: list[str], rows: list[list[str]]) -> str:
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
@@ -234,7 +229,7 @@ def diagnosis_table(outcomes: list[Outcome]) -> str:
                 [
                     str(num),
                     kind,
-                    f"{auroc(scores[wrong], scores[~wrong]):.4f}",
+                    f"{auroc(scores, wrong):.4f}",
                     f"{flagged[wrong].mean():.1%}",
                     f"{flagged[~wrong].mean():.1%}",
                 ]

@@ -436,6 +436,30 @@ def two_arms(kit: Kit, layout: Layout, hand: Hand) -> Drawn:
     return Drawn((at(tray, shape), at(goal, kit.shapes[1][:4])), tuple((poses[None], state) for poses, state in stops))
 
 
+def larger(kit: Kit, layout: Layout, hand: Hand) -> Drawn:
+    a, b = layout.things(2)
+    while True:
+        sizes = layout.number(0.6, 1.6), layout.number(0.6, 1.6)
+        if abs(sizes[0] - sizes[1]) >= 0.25:
+            break
+    shapes = [kit.shapes[0][:5] * size for size in sizes]
+    grasp = (a, b)[int(np.argmax(sizes))] @ down([0, 0], 0.03, 0.3)
+    return Drawn((at(a, shapes[0]), at(b, shapes[1])), carry(hand(grasp), hand(down([0.30, -0.35], 0.06, 0.0))))
+
+
+def middle(kit: Kit, layout: Layout, hand: Hand) -> Drawn:
+    poses = layout.things(3)
+    centre = np.mean([at(pose, point) for pose, point in zip(poses, kit.points, strict=True)], axis=0)
+    things = [at(pose, shape[:count]) for pose, shape, count in zip(poses, kit.shapes, (4, 3, 3), strict=True)]
+    return Drawn(tuple(things), carry(hand(poses[0] @ kit.grasps[0]), hand(down(centre[:2], 0.12, 0.0))))
+
+
+def row(kit: Kit, layout: Layout, hand: Hand) -> Drawn:
+    a, b, c = layout.things(3)
+    things = at(a, kit.shapes[0][:4]), at(b, kit.shapes[1][:3]), at(c, kit.shapes[2][:3])
+    return Drawn(things, carry(hand(a @ kit.grasps[0]), hand(down([b[0, 3], c[1, 3]], 0.04, 0.0))))
+
+
 FAMILIES = {
     family.name: family
     for family in (
@@ -456,5 +480,8 @@ FAMILIES = {
         Family("order", "of three things alike take the middle one from left to right", order, ("twice as far",)),
         Family("spacing", "put C on the line from A to B, as far behind B as A is before it", spacing),
         Family("two-arms", "lift a bar of any length at both ends, put its middle on B", two_arms),
+        Family("larger", "of two things of one shape take the larger one", larger, ("twice as far",)),
+        Family("middle", "release in the middle of three things", middle),
+        Family("row", "release where the row of B meets the column of C", row),
     )
 }

@@ -34,14 +34,13 @@ import numpy as np
 from pick_and_place import WITHIN_M
 from relation_families import FAMILIES, UNCOVERED, USUAL, Family, Scene
 from rich.progress import Progress
-from scipy.stats import mannwhitneyu
 from stand_in import StandIn
 
 from robust_instant_policy.commands.options import positive
 from robust_instant_policy.context import FactorisedPrompt
 from robust_instant_policy.errors import PlanningError, RipError
 from robust_instant_policy.evaluation.manifest import code_digest
-from robust_instant_policy.evaluation.statistics import wilson_interval
+from robust_instant_policy.evaluation.statistics import auroc, wilson_interval
 from robust_instant_policy.llm import LanguageModel, connect
 from robust_instant_policy.policies import (
     Context,
@@ -371,11 +370,11 @@ def cell(rows: Sequence[Row]) -> str:
 
 
 def confidence_table(rows: Sequence[Row]) -> str:
-    """By method, kind of scene and family: how many plans pass the gate, how many of these are wrong, and AUROC."""
-    lines = [
-        "| method | plans for | plans, right | right ones that pass | wrong among those that pass | AUROC |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
+    """By method, kind of scene and family: how many plans pass the gate, how many of these are wrong, and AUROC: of the
+    plans that no check refused, and of all."""
+    columns = ("method", "plans for", "plans, right", "right ones that pass", "wrong among those that pass")
+    columns = (*columns, "refused, of these right", "AUROC", "with refusals")
+    lines = ["| " + " | ".join(columns) + " |", "| --- " * len(columns) + "|"]
     for method, model in sorted({(row.case.method, row.case.model) for row in rows}):
         mine = [row for row in rows if (row.case.method, row.case.model) == (method, model)]
         parts = {"usual scenes": [row for row in mine if row.case.condition == USUAL]}
@@ -393,14 +392,14 @@ def trust(rows: Sequence[Row]) -> list[str]:
     passed = confidence >= GATE
     wrong, through = int((passed & ~right).sum()), int(passed.sum())
     low, high = wilson_interval(wrong, through)
-    both = right.any() and not right.all()
-    # the probability that a right plan has more confidence than a wrong one, ties half (Mann and Whitney 1947)
-    auroc = mannwhitneyu(confidence[right], confidence[~right]).statistic / right.sum() / (~right).sum() if both else 0
+    refused = np.array([row.outcome.evidence.get("errors", 0) > 0 for row in rows])
+    areas = [auroc(confidence[~refused], right[~refused]), auroc(confidence, right)]
     return [
         f"{len(rows)}, {int(right.sum())}",
         f"{passed[right].mean():.0%}" if right.any() else "–",
         f"{wrong} of {through}: {wrong / max(through, 1):.1%} ({low:.1%} to {high:.1%})",
-        f"{auroc:.3f}" if both else "–",
+        f"{int(refused.sum())}, {int(right[refused].sum())}",
+        *(f"{area:.3f}" if np.isfinite(area) else "–" for area in areas),
     ]
 
 

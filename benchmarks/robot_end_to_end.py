@@ -4,7 +4,8 @@
         [--llm embedded] [--folder runs/robot-end-to-end] [--out docs/tables/robot_end_to_end.md]
 
 A scripted hand moves the leader as the task's demonstrator moves: the leader's servos are on an emulated bus in a
-process of its own, as the follower's are. Both are read and written by the real drivers, at 50 Hz. Without ``--llm``
+process of its own, as the follower's are. Both are read and written by the real drivers, at 50 Hz. A browser's requests
+keep the page with the live picture busy. Without ``--llm``
 the plans are those of the nearest demonstrations (`neighbours`), which `rip run --plan` executes. The simulator
 executes the plans, too, in the same scenes. An interrupted run continues.
 """
@@ -12,12 +13,14 @@ executes the plans, too, in the same scenes. An interrupted run continues.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import multiprocessing
 import os
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -27,6 +30,7 @@ from types import MappingProxyType
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from robust_instant_policy.commands.live_camera import LiveCamera
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.errors import UnreachableError
 from robust_instant_policy.evaluation import scene_seed
@@ -36,7 +40,6 @@ from robust_instant_policy.policies.neighbours import Neighbours
 from robust_instant_policy.policies.policy import Plan
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_FILE, RunRecord, save_context
-from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig, DeviceConfig
 from robust_instant_policy.robots.emulation.client import emulated
 from robust_instant_policy.robots.emulation.servos import ServoBus
@@ -92,6 +95,15 @@ def lead(rest: np.ndarray, travel: float, wire: Connection) -> None:
     wire.send(ServoBus(SharedTwin(hand), 0, travel).options)
     while (rows := wire.recv()) is not None:
         hand.began, hand.rows = time.monotonic(), rows
+
+
+def watch(url: str) -> None:
+    """Ask for the page's pictures as a browser does."""
+    while True:
+        for path in ("live.jpg", "state", "start"):
+            with contextlib.suppress(OSError):
+                urllib.request.urlopen(f"{url}/{path}", timeout=5).read()
+        time.sleep(0.1)
 
 
 class Person:
@@ -166,8 +178,13 @@ def record(config: CellConfig, task: Task, folder: Path, count: int) -> dict[str
                 emulation.scene(seed)
                 return seed
 
-            camera = make_camera(config.camera, folder)
-            Session(station, [leader], camera, writer, person, lambda seen: None, next_scene).record(count)
+            camera = LiveCamera(config.camera, folder, folder, config.limits.workspace)
+            camera.connect()
+            browser = multiprocessing.get_context("spawn").Process(target=watch, args=(camera.url,), daemon=True)
+            browser.start()
+            Session(station, [leader], camera, writer, person, camera.show, next_scene).record(count)
+            browser.terminate()
+            camera.disconnect()
             leader.disconnect()
     ours.send(None)
     leading.join()

@@ -126,7 +126,7 @@ class Cell:
         leader.connect()
         camera = make_camera(self.config.camera, self.file.parent)
         camera.connect()
-        return Session(station, [leader], camera, writer, operator, preview=lambda seen: None)
+        return Session(station, [leader], camera, writer, operator, show=lambda seen: None)
 
 
 def shown(seconds=1.6, rate_hz=50.0, close_at=0.5, joint=0):

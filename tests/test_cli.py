@@ -13,7 +13,9 @@ import pytest
 
 from robust_instant_policy import Observation, Plan
 from robust_instant_policy.cli import main
+from robust_instant_policy.commands.console import StageConsole
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
+from robust_instant_policy.interrupts import noted_interrupts
 
 
 def refused(arguments: list[str], capsys) -> tuple[int, str]:
@@ -157,6 +159,19 @@ def test_ctrl_c_ends_a_recording_in_one_line_and_keeps_finished_episodes(tmp_pat
     assert "stopped" in error.strip().splitlines()[-1]
     assert "Traceback" not in error
     assert len(load_demonstrations(folder)) >= 1
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_ctrl_c_that_python_drops_ends_the_command_at_its_next_stage():
+    class Library:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)  # Python prints what a destructor raises, and goes on
+
+    with noted_interrupts():
+        library = Library()
+        del library
+        with pytest.raises(KeyboardInterrupt), StageConsole().stage("execution"):
+            pytest.fail("the stage began")
 
 
 def test_a_plan_is_made_from_files_alone(workbench, tmp_path, capsys):

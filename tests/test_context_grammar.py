@@ -13,6 +13,8 @@ from robust_instant_policy.context import Prompt, write_prompt
 from robust_instant_policy.context.things import find_things, locate
 from robust_instant_policy.context.ways import find_ranking
 from robust_instant_policy.policies import Neighbours, context_of_keypoints, scene_of_keypoints
+from robust_instant_policy.policies.confidence import UNKNOWN
+from robust_instant_policy.trajectory import Trajectory
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -22,10 +24,10 @@ from relations import key_error
 WITHIN_M = 0.015
 
 
-def shown(family: str, count: int = 10, noise: float = 0.002):
-    """Demonstrations of a family: keypoints, trajectories, and what draws more scenes."""
-    draw = FAMILIES[family].scenes("tune", 7, noise)
-    scenes = [draw(number) for number in range(count)]
+def shown(family: str, count: int = 10, noise: float = 0.002, number: int = 7):
+    """Set ``number`` of a family's demonstrations: keypoints, trajectories, and what draws more scenes."""
+    draw = FAMILIES[family].scenes("tune", number, noise)
+    scenes = [draw(index) for index in range(count)]
     return np.stack([scene.keypoints for scene in scenes]), [scene.trajectory for scene in scenes], draw
 
 
@@ -47,6 +49,8 @@ def errors(prompt: Prompt, draw, count: int = 6) -> np.ndarray:
         ("along", "of any size"),
         ("lid", "hinged to"),
         ("place", "axes of keypoints"),
+        ("middle", " and 34% to keypoints 4-6"),
+        ("row", "x 101%, y 0%"),
     ],
 )
 def test_a_relation_is_inferred_carried_over_and_told_in_words(family, words):
@@ -57,9 +61,9 @@ def test_a_relation_is_inferred_carried_over_and_told_in_words(family, words):
     assert prompt.ways == (prompt,)
 
 
-@pytest.mark.parametrize("family", ["nearest", "side", "mirror", "flip"])
-def test_demonstrations_that_do_different_things_are_told_apart(family):
-    keypoints, trajectories, draw = shown(family)
+@pytest.mark.parametrize(("family", "number"), [("nearest", 7), ("side", 7), ("mirror", 7), ("flip", 7), ("larger", 3)])
+def test_demonstrations_that_do_different_things_are_told_apart(family, number):
+    keypoints, trajectories, draw = shown(family, number=number)
     prompt = write_prompt(keypoints, trajectories)
     assert (errors(prompt, draw) < WITHIN_M).mean() > 0.8
     assert "told apart by" in " ".join(prompt.notes())
@@ -115,6 +119,25 @@ def test_between_two_ways_one_is_followed_whole_and_a_note_says_so():
         for way in ways
     ]
     assert min(apart) < 0.02 < max(apart)
+
+
+def test_a_plan_is_doubted_where_it_was_not_found_what_demonstrations_have_in_common():
+    keypoints, trajectories, draw = shown("place")
+    scattered = np.random.default_rng(0).normal(0, 0.15, (10, 3)) * [1, 1, 0]
+    late = np.arange(30)[:, None] >= 12
+    released = [
+        Trajectory.from_actions(own.actions + late * np.append(np.tile(moved, 3), 0))
+        for own, moved in zip(trajectories, scattered, strict=True)
+    ]
+    new = scene_of_keypoints(draw(1000, exact=True).keypoints)
+    policy = Neighbours()
+    sure, doubted = (
+        policy.fit_context(context_of_keypoints(keypoints, own, policy.settings)).plan_scene(new)
+        for own in (trajectories, released)
+    )
+    assert sure.confidence > 0.9
+    assert doubted.confidence <= UNKNOWN
+    assert any("what they have in common there was not found" in note for note in doubted.notes)
 
 
 def test_each_way_shows_a_model_its_own_demonstrations():

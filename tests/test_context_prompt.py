@@ -136,10 +136,8 @@ def test_a_place_between_two_objects_is_followed():
     keypoints, trajectories = demonstrations()
     prompt = write_prompt(keypoints, [half_way(*pair) for pair in zip(keypoints, trajectories, strict=True)])
     frame = prompt.frames.arms[0][-1]
-    assert str(frame).startswith(
-        f"{frame.share:.0%} of the way from keypoints 0-4 to keypoints 5-9, axes of keypoints 5-9"
-    )
-    assert frame.share == pytest.approx(0.5, abs=0.03)
+    assert str(frame).startswith(f"{frame.way} of the way from keypoints 0-4 to keypoints 5-9, axes of keypoints 5-9")
+    assert frame.shares[0] == pytest.approx(0.5, abs=0.03)
     for seed in range(100, 110):
         new, truth = scene(seed)
         planned = prompt.median_trajectory(new)
@@ -175,7 +173,7 @@ def test_axes_along_a_line_turn_with_it_seen_from_above_and_in_space():
     scene = locate([WORLD, first, second], keypoints)
     line = ends[1].position(scene) - ends[0].position(scene)
     for in_space in (False, True):
-        frame = Frame(Axes(ends, in_space), (first, second), (np.zeros(3),) * 2, share=0.25)
+        frame = Frame(Axes(ends, in_space), (first, second), (np.zeros(3),) * 2, (np.full(3, 0.25),))
         pose = frame.pose(keypoints[0])
         expected = line[0] if in_space else line[0] * [1, 1, 0]
         assert np.allclose(pose[:3, 0], expected / np.linalg.norm(expected))

@@ -347,3 +347,25 @@ def test_the_urdf_of_the_viperx_moves_its_tool_as_the_simulated_arm_does(cell):
     simulated = viperx("left").kinematics
     for joints in np.random.default_rng(0).uniform(low, high, (20, len(low))):
         np.testing.assert_allclose(arm.kinematics.tool_pose(joints), simulated.tool_pose(joints), atol=1e-4)
+
+
+FOLDED = np.array([0.0, -1.80, 1.55, 0.0, 0.3, 0.0])  # forearm on the upper arm, as the arm rests when it is not used
+
+
+def test_links_of_one_arm_that_would_meet_are_refused_by_name(cell):
+    (arm,), limits = cell
+    inward = np.array([0.0, -0.9, 1.55, 0.0, 1.9, 0.0])  # the hand turns back towards the shoulder
+    wide = replace(limits, workspace=np.array([[-2.0, -2.0, -0.1], [2.0, 2.0, 2.0]]))
+    motion = joint_motion(arm.home[None], inward[None], np.array([0.03]), [arm], HZ, speed=0.3)
+    with pytest.raises(UnreachableError, match=r"between its links \w+ and gripper is .* \(link_distance in the cell"):
+        check_motion(motion, [arm], wide, HZ)
+
+
+def test_an_arm_that_was_switched_on_folded_unfolds_but_does_not_fold_further(cell):
+    (arm,), limits = cell
+    wide = replace(limits, workspace=np.array([[-2.0, -2.0, -0.1], [2.0, 2.0, 2.0]]))
+    away = park_motion(FOLDED[None], np.array([0.03]), [arm], wide, HZ, speed=0.5)
+    np.testing.assert_allclose(away.joints[-1, 0], arm.home, atol=1e-3)
+    back = replace(away, joints=away.joints[::-1].copy())
+    with pytest.raises(UnreachableError, match="the distance between its links"):
+        Space([arm], wide).check(back.joints, HZ)

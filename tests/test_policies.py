@@ -202,14 +202,13 @@ SURE = Evidence(
     [
         {"agreement": 0.1},
         {"vote": 0.5},
-        {"distortion": 5.0},
+        {"distortion": 2.9},
         {"prediction": 0.05},
         {"novelty": 4.0},
         {"displacement": 0.04},
         {"precision": 0.04},
         {"doubts": 1},
         {"warnings": 2},
-        {"undecided": 1},
     ],
     ids=lambda worse: next(iter(worse)),
 )
@@ -223,9 +222,12 @@ def test_a_tie_or_an_error_of_a_check_leaves_no_confidence():
     assert plan_confidence(replace(SURE, errors=1)) == 0
 
 
-@pytest.mark.parametrize("unknown", ["prediction", "novelty"])
-def test_demonstrations_that_cannot_tell_bound_the_confidence(unknown):
-    assert plan_confidence(replace(SURE, **{unknown: float("nan")})) == UNKNOWN
+@pytest.mark.parametrize(
+    "unknown", [{"prediction": np.nan}, {"novelty": np.nan}, {"undecided": 1}, {"distortion": 3.5}]
+)
+def test_what_cannot_be_known_bounds_the_confidence(unknown):
+    assert plan_confidence(replace(SURE, **unknown)) == UNKNOWN
+    assert len(replace(SURE, **unknown).unknown_notes) == 1
 
 
 def test_demonstrations_of_one_scene_tell_nothing_about_others():

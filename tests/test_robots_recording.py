@@ -1,16 +1,24 @@
 """Recording with leader and follower on emulated buses, through the real drivers."""
 
+import io
+import json
 import resource
 import subprocess
 import sys
+import time
+import urllib.error
+import urllib.request
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("dynamixel_sdk")
 
+from robust_instant_policy.commands.live_camera import LiveCamera
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
+from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import RobotError, StoppedError
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.journal import Journal
@@ -181,3 +189,39 @@ def test_a_full_disk_is_told_and_the_demonstration_is_stored_once_there_is_space
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert any("no space left" in line for line in cell.operator.said)
+
+
+def test_the_page_shows_the_live_picture_and_the_keypoints_of_the_start_image(cell, tmp_path):
+    def get(path, host="127.0.0.1"):
+        return urllib.request.urlopen(urllib.request.Request(camera.url + path, headers={"Host": host})).read()
+
+    camera = LiveCamera(cell.config.camera, tmp_path, tmp_path / "demos", cell.config.limits.workspace)
+    camera.connect()
+    try:
+        camera.say("hold the leader <here>")
+        frame = camera.read()
+        camera.show(Observation(frame.rgb, frame.depth, frame.intrinsics, np.eye(4)))
+        within(20, lambda: b"once there is a demonstration" in get("/start"))
+        assert json.loads(get("/state"))["line"] == "hold the leader <here>"
+        shown = np.asarray(Image.open(io.BytesIO(get("/live.jpg"))), dtype=float)
+        grey = (image @ [0.299, 0.587, 0.114] for image in (shown, frame.rgb))  # JPEG keeps fewer colours
+        assert np.corrcoef(*map(np.ravel, grey))[0, 1] > 0.9
+        assert b"/live.jpg" in get("/")
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            get("/live.jpg", host="attacker.example")
+        for _ in range(11):  # looking used up none
+            camera.read()
+        with pytest.raises(RobotError, match=r"the 12 images of .* are used up"):
+            camera.read()
+    finally:
+        camera.disconnect()
+    with pytest.raises(RobotError, match="has ended"):
+        camera.read()
+
+
+def within(seconds, happens):
+    """Wait until ``happens()`` is true."""
+    end = time.monotonic() + seconds
+    while not happens():
+        assert time.monotonic() < end
+        time.sleep(0.05)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from robust_instant_policy import __version__
 from robust_instant_policy.errors import RipError
+from robust_instant_policy.interrupts import noted_interrupts
 
 # Each command is a module in `commands`. Only the one that runs is imported, because others may need more packages.
 COMMANDS = {
@@ -35,11 +36,17 @@ COMMANDS = {
     "calibrate": "calibrate the camera, a gripper or a leader arm of a real cell",
     "doctor": "check this machine, and say how to install what is missing",
 }
+CONTINUED = {"demo", "record", "eval", "train"}  # that go on where an earlier run was stopped
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line and return its exit status; errors become one line on standard error."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    with noted_interrupts():
+        return _main(arguments)
+
+
+def _main(arguments: list[str]) -> int:
     debug = "--debug" in arguments
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # characters that the terminal lacks become ?
@@ -49,7 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.arguments = arguments
         return options.run(options)
     except KeyboardInterrupt:
-        print("rip: stopped; finished work is kept; run the same command again to continue", file=sys.stderr)
+        kept = "; finished work is kept; run the same command again to continue"
+        print(f"rip: stopped{kept if _command(arguments) in CONTINUED else ''}", file=sys.stderr)
         return 1
     except RipError as error:
         if debug:
@@ -79,7 +87,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--version", action="version", version=f"rip {__version__}")
     parser.add_argument("--debug", action="store_true", help="show a traceback when something breaks")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    chosen = next((word for word in arguments if not word.startswith("-")), None)
+    chosen = _command(arguments)
     for name, summary in COMMANDS.items():
         command = commands.add_parser(name, help=summary, description=summary)
         command.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
@@ -89,6 +97,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
             module.add_arguments(command)
             command.set_defaults(run=module.run)
     return parser.parse_args(arguments)
+
+
+def _command(arguments: Sequence[str]) -> str | None:
+    return next((word for word in arguments if not word.startswith("-")), None)
 
 
 def _describe(error: OSError) -> str:

@@ -148,7 +148,7 @@ def new_folder(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise write_error(path, error) from error
     if not is_free:
-        raise DatasetError(f"{path} exists already; choose a new folder")
+        raise DatasetError(f"{path} exists already; where this command wrote it, it is complete; else choose another")
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART_SUFFIX}")
     try:
         make_folder(part)

@@ -100,11 +100,10 @@ def fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) -> 
     ``(..., 4, 4)``.
     """
     share = weights / weights.sum(axis=-1, keepdims=True)
-    source_mean = (share[..., None, :] @ source)[..., 0, :]
+    weighted = np.swapaxes(source * share[..., None], -1, -2)
+    source_mean = weighted.sum(axis=-1)
     target_mean = (share[..., None, :] @ target)[..., 0, :]
-    a = source[..., :2] - source_mean[..., None, :2]
-    b = target[..., :2] - target_mean[..., None, :2]
-    products = np.swapaxes(a * share[..., None], -1, -2) @ b
+    products = weighted @ target - source_mean[..., :, None] * target_mean[..., None, :]
     sine = products[..., 0, 1] - products[..., 1, 0]
     rotation = rotations_about_vertical(np.arctan2(sine, products[..., 0, 0] + products[..., 1, 1]))
     motion = np.zeros((*rotation.shape[:-2], 4, 4))

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from robust_instant_policy.interrupts import raise_pending
 from robust_instant_policy.policies.policy import Stage
 
 TRAINING_LINE_S = 30.0  # between two progress lines of a training without a terminal
@@ -28,12 +29,14 @@ class StageConsole:
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Time a stage, with a progress bar on a terminal; a stage that raises is not counted."""
+        raise_pending()
         self.done_so_far(name, 0, 0)
         start = time.perf_counter()
         try:
             yield
         finally:
             self._clear()
+        raise_pending()
         seconds = time.perf_counter() - start
         self.stages.append(Stage(name, seconds))
         self.say(f"  {name:<34}{seconds:7.1f} s")

@@ -7,18 +7,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial
 from itertools import count
-from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import beside
-from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
-from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import CellError, RipError, UsageError
-from robust_instant_policy.files import write_whole
-from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.perception import KeypointExtractor
-from robust_instant_policy.reporting.keypoints import keypoints_page
-from robust_instant_policy.robots.cameras import make_camera
+from robust_instant_policy.commands.live_camera import LiveCamera
+from robust_instant_policy.datasets import DatasetWriter
+from robust_instant_policy.errors import CellError, UsageError
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.client import Emulation, devices_of
 from robust_instant_policy.robots.leaders import make_leader
@@ -39,14 +32,19 @@ def record_cell(options: argparse.Namespace) -> int:
             raise CellError(f"{options.robot}: the camera is not calibrated; run: rip calibrate camera")
         config, emulation = stack.enter_context(devices_of(config))
         assert config.camera is not None
-        terminal = stack.enter_context(Terminal(stack.enter_context(stop_on_signals()), screen.say))
-        station = Station(config)
         folder = config.path.parent
+        camera = LiveCamera(config.camera, folder, options.out, config.limits.workspace)
+
+        def say(line: str) -> None:
+            screen.say(line)
+            camera.say(line)
+
+        terminal = stack.enter_context(Terminal(stack.enter_context(stop_on_signals()), say))
+        station = Station(config)
         leaders = [
             make_leader(one, arm, config.rate_hz, folder, terminal.pressed)
             for one, arm in zip(config.arms, station.arms, strict=True)
         ]
-        camera = make_camera(config.camera, folder)
         writer = stack.enter_context(DatasetWriter(options.out, options.task, options.description, config.rate_hz))
         last = writer.last_seed
         next_scene = (
@@ -58,8 +56,8 @@ def record_cell(options: argparse.Namespace) -> int:
             stack.callback(leader.disconnect)
         camera.connect()
         stack.callback(camera.disconnect)
-        preview = partial(_preview, options.out, screen, config.limits.workspace)
-        Session(station, leaders, camera, writer, terminal, preview, next_scene).record(options.episodes)
+        screen.say(f"live picture and keypoints: {camera.url}")
+        Session(station, leaders, camera, writer, terminal, camera.show, next_scene).record(options.episodes)
     screen.say(f"{options.out}: {writer.num_episodes} demonstrations of {options.task}, {writer.discarded} discarded")
     return 0
 
@@ -68,18 +66,3 @@ def _next_scene(emulation: Emulation, seeds: Iterator[int]) -> int:
     seed = next(seeds)
     emulation.scene(seed)
     return seed
-
-
-def _preview(demos: Path, screen: StageConsole, workspace: FloatArray, seen: Observation) -> None:
-    """Write a page with the keypoints of the demonstrations so far and those found in a start image."""
-    try:
-        recorded = load_demonstrations(demos)
-        extractor = KeypointExtractor(workspace=workspace)
-        extractor.fit([one.observation for one in recorded], [one.trajectory for one in recorded])
-        page = keypoints_page(extractor, [one.observation for one in recorded], [seen], None, "Keypoints")
-    except RipError as error:  # too few demonstrations so far, too little in common, or a missing package
-        screen.say(f"  no keypoints yet: {error}")
-        return
-    out = beside(demos, "-preview.html")
-    write_whole(out, page.encode())
-    screen.say(f"  page: {out}")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from robust_instant_policy.demonstration import Observation
@@ -85,8 +87,14 @@ class TaskTwin:
         rows = measured.reshape(len(loads), -1)
         return [TwinState(row[:-1], float(row[-1]), float(load)) for row, load in zip(rows, loads, strict=True)]
 
-    def photograph(self) -> Observation:
-        return self._renderer.submit(self._cell.photograph).result()
+    def photograph(self) -> Callable[[], Observation]:
+        cell = self._cell
+        if not isinstance(getattr(cell, "data", None), mujoco.MjData):  # SAPIEN renders the scene itself
+            seen = self._renderer.submit(cell.photograph).result()
+            return lambda: seen
+        still = copy(cell)
+        still.data = copy(cell.data)
+        return self._renderer.submit(still.photograph).result
 
     def failure(self) -> str:
         return str(self._cell.failure())

@@ -154,10 +154,12 @@ class _Run:
             with self._screen.stage("execution"), stop_on_signals() as stop:
                 played = station.play(motion, stop)
             played.path.save(self._out / MEASURED_FILE)
-            replace(record, outcome=UNJUDGED).save(self._out)  # a person may take long to judge
-            success, outcome = self._judge(played)
             grasps = played.path.empty_grasps([arm.name for arm in station.arms])
-            self._report(record, success, "; ".join([outcome, *grasps]))
+            success, outcome = self._outcome(played)
+            self._report(record, success, [outcome, *grasps])
+            if outcome == UNJUDGED and not self._options.yes:
+                success = _agrees("did it succeed?")
+                self._report(record, success, ["success" if success else "failed: judged so", *grasps])
             played.require_end()
         if success:  # not where nobody judged it
             write_whole(self._done, b"")
@@ -215,24 +217,20 @@ class _Run:
             finally:
                 camera.disconnect()
 
-    def _judge(self, played: Played) -> tuple[bool | None, str]:
-        """Whether the task is done, None if nobody says, and the outcome in words."""
+    def _outcome(self, played: Played) -> tuple[bool | None, str]:
+        """Whether the task is done, None where only a person can say, and the outcome in words."""
         if played.stopped:
             return False, f"stopped: {played.stopped}"
-        if self._emulation is not None:
-            failure = self._emulation.failure()
-            return not failure, f"failed: {failure}" if failure else "success"
-        if self._options.yes:
+        if self._emulation is None:
             return None, UNJUDGED
-        try:
-            success = _agrees("did it succeed?")
-        except (StoppedError, KeyboardInterrupt):
-            return None, UNJUDGED
-        return success, "success" if success else "failed: judged so"
+        failure = self._emulation.failure()
+        return not failure, f"failed: {failure}" if failure else "success"
 
-    def _report(self, record: RunRecord, success: bool | None, outcome: str) -> None:
-        replace(record, success=success, outcome=outcome, stages=tuple(self._screen.stages)).save(self._out)
-        self._screen.say(outcome)
+    def _report(self, record: RunRecord, success: bool | None, outcome: Sequence[str]) -> None:
+        """Write the page; the ``outcome`` in words is printed, too."""
+        words = "; ".join(outcome)
+        replace(record, success=success, outcome=words, stages=tuple(self._screen.stages)).save(self._out)
+        self._screen.say(words)
         self._screen.say(f"report: {write_report(self._out)}")
 
     def _confirm(self, question: str) -> None:

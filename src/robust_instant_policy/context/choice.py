@@ -1,12 +1,13 @@
 """Which frame each step is written in: the one that predicts a demonstration best from the others.
 
-A candidate is a choice of axes R and of the one or two things on which the origin depends. In a scene, the hand's
+A candidate is a choice of axes R and of the one to three things on which the origin depends. In a scene, the hand's
 centre is
 
-    y = o + X w,   X = [o' - o | B | B' | R | (s - 1) R …]
+    y = o + X w,   X = [o' - o … | B | B' … | R | (s - 1) R …]
 
 with o, o' the things' positions, B, B' their axes, and s the sizes of things that have one: share of the way, points
-fixed in the things, offset in the axes and its growth are all linear. Ridge regression gives w, and its hat matrix H
+fixed in the things, offset in the axes and its growth are all linear. Where the way counts along each axis, o' - o is
+its three parts along R. Ridge regression gives w, and its hat matrix H
 the residuals of each demonstration when it is left out, (I - H_ii)⁻¹ r_i, for all candidates and steps at once (the
 keypoints of the one that is left out are noisy, too). The hand's turn is predicted by the mean of the others' in the
 axes.
@@ -40,29 +41,35 @@ KEY_STEP_WEIGHT = 3.0  # of the first and last step and of gripper changes; 1 el
 # Expected error of a single demonstration, a metre to a thing that is seen in its own axes, and to one that has none.
 DISTANCE_SHARE, UNTURNED_SHARE = 0.05, 0.3
 MAX_LOOSE = 4  # keypoints of their own, between which lines are drawn
+UNEXPLAINED_M = 0.015  # error of a key step from which on more origins are tried
+# Where the numbers w stand: shares, three for each further end; points in the ends; offset; its growth with each size.
+SHARES, POINTS, OFFSET, GROWTH = slice(0, 6), slice(6, 15), slice(15, 18), slice(18, None)
 
 ZERO = np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
-    """All combinations of ``axes`` and ``origins`` for demonstrations in ``scene``.
+class Origin:
+    """On which things an origin depends: the ``ends``, one to three, and those with whose size it moves. ``by_axis`` it
+    is at a share of the way of its own along each axis."""
 
-    An origin is one or two things, and those with whose size it moves.
-    """
+    ends: tuple[Thing, ...]
+    growing: tuple[Thing, ...] = ()
+    by_axis: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """All combinations of ``axes`` and ``origins`` for demonstrations in ``scene``."""
 
     scene: Scene
     axes: tuple[Axes, ...]
-    origins: tuple[tuple[tuple[Thing, ...], tuple[Thing, ...]], ...]
+    origins: tuple[Origin, ...]
     growing: tuple[Thing, ...]
 
     @classmethod
     def of(cls, things: Sequence[Thing], scene: Scene) -> Candidates:
-        still = [WORLD, *(thing for thing in things if thing.kind in ("upright", "scaled"))]
-        points = [thing for thing in things if thing.kind == "point"]
-        sized = {member for thing in things if thing.kind == "scaled" for member in thing.members}
-        loose = [point for point in points if sized.isdisjoint(point.members)]
-        ends = still + (loose if len(loose) <= MAX_LOOSE else [])
+        ends, points = _ends(things)
         few = len(scene[WORLD].size) < DEMOS_TO_TELL_THINGS
         pairs = [] if few else list(combinations(ends, 2))
         axes = [Axes((Anchor(thing, ZERO),)) for thing in (WORLD, *things) if thing is WORLD or thing.turns]
@@ -72,43 +79,68 @@ class Candidates:
             rise = np.ptp(scene[pair[1]].position[:, 2] - scene[pair[0]].position[:, 2])
             if rise > 10 * NOISE_M and WORLD not in pair:
                 axes.append(replace(line, in_space=True))
-        singles = [(thing,) for thing in (*still, *points, *(t for t in things if t.kind == "hinged"))]
+        hinged = [thing for thing in things if thing.kind == "hinged"]
+        singles = [(thing,) for thing in dict.fromkeys([*ends, *points, *hinged])]
         growing = tuple(thing for thing in things if thing.kind == "scaled")
-        ways = [(ends, grows) for ends in (*singles, *pairs) for grows in dict.fromkeys(((), growing))]
-        return cls(scene, tuple(axes), tuple(ways), growing)
+        origins = [Origin(own, grows) for own in (*singles, *pairs) for grows in dict.fromkeys(((), growing))]
+        return cls(scene, tuple(axes), tuple(origins), growing)
+
+    def with_more_origins(self, things: Sequence[Thing]) -> Candidates:
+        """With shares along each axis of the way between two things, and shares of the ways between three."""
+        ends, _ = _ends(things)
+        more = [Origin(pair, by_axis=True) for pair in combinations(ends, 2)]
+        more += [Origin(three) for three in combinations(ends, 3)]
+        return replace(self, origins=(*self.origins, *more))
 
     def nearest(self, squared: FloatArray) -> tuple[int, ...]:
         """The keypoints of the one thing whose frames explain a step with errors ``squared (M, N)`` best."""
-        single = [n for n, (ends, _) in enumerate(self.origins) if len(ends) == 1]
-        return self.origins[single[int(squared[:, single].min(axis=0).argmin())]][0][0].members
+        single = [n for n, origin in enumerate(self.origins) if len(origin.ends) == 1]
+        return self.origins[single[int(squared[:, single].min(axis=0).argmin())]].ends[0].members
 
     def start(self, home: FloatArray) -> FloatArray:
         """o ``(N, I, 3)`` of each origin; the world's is ``home (3,)``."""
-        first = np.stack([self.scene[ends[0]].position for ends, _ in self.origins])
-        first[[ends[0] is WORLD for ends, _ in self.origins]] += home
-        return first
+        return np.stack([self._position(origin.ends[0], home) for origin in self.origins])
+
+    def _position(self, end: Thing, home: FloatArray) -> FloatArray:
+        return self.scene[end].position + (home if end is WORLD else 0.0)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """Which of all numbers w any of the origins has."""
+        most = max(len(origin.ends) for origin in self.origins)
+        by_axis = any(origin.by_axis for origin in self.origins)
+        shares = [[0, 1, 2] if by_axis else [0], [3]]
+        ends = [number for own in shares[: most - 1] for number in own] + list(
+            range(POINTS.start, POINTS.start + 3 * most)
+        )
+        return np.array([*ends, *range(OFFSET.start, OFFSET.stop + 3 * len(self.growing))])
 
     def design(self, home: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """X ``(M, N, I, 3, P)`` of all combinations, and the P ridge penalties."""
-        start, scene = self.start(home), self.scene
-        num, demos = start.shape[:2]
-        fixed = np.zeros((num, demos, 3, 7))
-        for index, (origin, _) in enumerate(self.origins):
-            if origin[0].turns and len(origin) == 2:
-                fixed[index, ..., 1:4] = scene[origin[0]].rotation
-            if len(origin) == 2:
-                fixed[index, ..., 0] = scene[origin[1]].position - start[index]
-                if origin[1].turns:
-                    fixed[index, ..., 4:7] = scene[origin[1]].rotation
-            elif origin[0].turns:
-                fixed[index, ..., 4:7] = scene[origin[0]].rotation
-        rotation = self.rotations()
+        """X ``(M, N, I, 3, P)`` of all combinations, and the P ridge penalties, of the `numbers` alone."""
+        scene, rotation = self.scene, self.rotations()
+        deviations = np.array(
+            [SHARE_STD] * 6 + [POINT_STD_M] * 9 + [OFFSET_STD_M] * 3 + [GROWTH_STD_M] * (3 * len(self.growing))
+        )
+        demos = rotation.shape[1]
+        design = np.zeros((len(rotation), len(self.origins), demos, 3, len(deviations)))
         sizes = [(scene[thing].size - 1)[:, None, None] * rotation for thing in self.growing]
-        moved = np.repeat(np.concatenate([rotation, *sizes], axis=-1)[:, None], num, axis=1)
-        moved[:, [not grows for _, grows in self.origins], ..., 3:] = 0.0
-        parts = np.broadcast_to(fixed, (len(rotation), *fixed.shape)), moved
-        deviations = [SHARE_STD, *[POINT_STD_M] * 6, *[OFFSET_STD_M] * 3, *[GROWTH_STD_M] * (3 * len(self.growing))]
-        return np.concatenate(parts, axis=-1), (NOISE_M / np.array(deviations)) ** 2
+        design[..., OFFSET.start :] = np.concatenate([rotation, *sizes], axis=-1)[:, None]
+        for index, origin in enumerate(self.origins):
+            own = design[:, index]  # (M, I, 3, P)
+            if not origin.growing:
+                own[..., GROWTH] = 0.0
+            first = self._position(origin.ends[0], home)
+            for number, end in enumerate(origin.ends):
+                if end.turns:
+                    own[..., POINTS.start + 3 * number :][..., :3] = scene[end].rotation
+                if number:
+                    away = (self._position(end, home) - first)[..., None]
+                    parts = (
+                        rotation * (np.swapaxes(rotation, -1, -2) @ away).swapaxes(-1, -2) if origin.by_axis else away
+                    )
+                    own[..., 3 * (number - 1) :][..., : parts.shape[-1]] = parts
+        numbers = self.numbers
+        return design[..., numbers], (NOISE_M / deviations[numbers]) ** 2
 
     def rotations(self) -> FloatArray:
         """``(M, I, 3, 3)``."""
@@ -176,14 +208,15 @@ def _guess(candidates: Candidates, offset: FloatArray, demos: int) -> FloatArray
     distance = np.linalg.norm(offset, axis=2)  # (N, I, T)
     noise = np.full(distance.shape, NOISE_M**2)
     suits = np.zeros((len(candidates.axes), len(candidates.origins)))
-    for index, ((thing, *_), _) in enumerate(candidates.origins):
+    for index, origin in enumerate(candidates.origins):
+        thing = origin.ends[0]
         if thing.shape is not None:
             radius = ((thing.shape - thing.shape.mean(axis=0)) ** 2).sum()
             noise[index] = NOISE_M**2 * (1 / len(thing.shape) + distance[index] ** 2 / radius)
         for row, axes in enumerate(candidates.axes):
             own = axes.ends[0].thing
             suits[row, index] = 0.0 if own is thing or (own is WORLD and not thing.turns) else np.inf
-    turning = np.array([thing.turns or thing is WORLD for (thing, *_), _ in candidates.origins])
+    turning = np.array([origin.ends[0].turns or origin.ends[0] is WORLD for origin in candidates.origins])
     share = np.where(turning, DISTANCE_SHARE, UNTURNED_SHARE)[:, None, None]
     guess = noise + (share * distance / demos) ** 2
     return np.moveaxis(guess, -1, 0)[:, None] + suits[None, :, :, None]
@@ -193,7 +226,7 @@ def choose_frames(things: Sequence[Thing], scene: Scene, hands: FloatArray, key_
     """The frame of each step for one arm's ``hands (I, T, 3, 3)``, the gripper's three points in each demonstration.
 
     Viterbi over the steps: leave-one-out error plus a cost for each change. Where lines suit, the points between which
-    they run are fitted, and all is judged again.
+    they run are fitted, and all is judged again; where a key step is not explained, with more origins.
     """
     weight = np.ones(hands.shape[1])
     weight[list(key_steps)] = KEY_STEP_WEIGHT
@@ -202,6 +235,9 @@ def choose_frames(things: Sequence[Thing], scene: Scene, hands: FloatArray, key_
     if len(hands) >= DEMOS_TO_TELL_THINGS:
         candidates = _with_fitted_lines(candidates, errors, hands, weight)
         errors = prediction_errors(candidates, hands)
+        if errors.mean_squared[list(key_steps)].min(axis=(1, 2)).max() > UNEXPLAINED_M**2:
+            candidates = candidates.with_more_origins(things)
+            errors = prediction_errors(candidates, hands)
     chosen = _viterbi(errors.cost.reshape(len(weight), -1) * weight[:, None])
     picks = [np.unravel_index(index, errors.cost.shape[1:]) for index in chosen]
     return _fitted(candidates, errors, hands, [(int(m), int(n)) for m, n in picks])
@@ -276,20 +312,35 @@ def _fitted(candidates: Candidates, errors: Errors, hands: FloatArray, picks: Se
     start, (design, penalty) = candidates.start(home), candidates.design(home)
     frames = []
     for step, (m, n) in enumerate(picks):
-        (origin, grows), x = candidates.origins[n], design[m, n]
+        origin, x = candidates.origins[n], design[m, n]
         target = centre[:, step] - start[n]
         weight = np.ones(len(hands))
         for _ in range(5):
             gram = np.einsum("i,ixa,ixb->ab", weight, x, x) + np.diag(penalty)
-            w = np.linalg.solve(gram, np.einsum("i,ixa,ix->a", weight, x, target))
-            squared = ((x @ w - target) ** 2).sum(axis=1)
+            found = np.linalg.solve(gram, np.einsum("i,ixa,ix->a", weight, x, target))
+            squared = ((x @ found - target) ** 2).sum(axis=1)
             weight = 1 / (1 + squared / max(float(np.median(squared)), NOISE_M**2) / 3)
-        share = float(w[0]) if len(origin) == 2 else 0.0
-        shifts = [w[1:4], w[4:7]] if len(origin) == 2 else [w[4:7]]
-        if origin[0] is WORLD:
-            shifts[0] = (1 - share) * home
-        grown = w[10:].reshape(-1, 3)
-        growth = tuple(zip(grows, grown, strict=False))
-        error = float(np.sqrt(np.median(errors.squared[step, m, n])))
-        frames.append(Frame(candidates.axes[m], origin, tuple(shifts), share, growth, error))
+        w = np.zeros(GROWTH.start + 3 * len(candidates.growing))
+        w[candidates.numbers] = found
+        shares = w[SHARES].reshape(2, 3)[: len(origin.ends) - 1]
+        frames.append(
+            Frame(
+                candidates.axes[m],
+                origin.ends,
+                tuple(w[POINTS].reshape(3, 3)[: len(origin.ends)]),
+                tuple(shares if origin.by_axis else np.repeat(shares[:, :1], 3, axis=1)),
+                tuple(zip(origin.growing, w[GROWTH].reshape(-1, 3), strict=False)),
+                home,
+                float(np.sqrt(np.median(errors.squared[step, m, n]))),
+            )
+        )
     return frames
+
+
+def _ends(things: Sequence[Thing]) -> tuple[list[Thing], list[Thing]]:
+    """The things between which an origin may lie, and all loose points."""
+    still = [WORLD, *(thing for thing in things if thing.kind in ("upright", "scaled"))]
+    points = [thing for thing in things if thing.kind == "point"]
+    sized = {member for thing in things if thing.kind == "scaled" for member in thing.members}
+    loose = [point for point in points if sized.isdisjoint(point.members)]
+    return still + (loose if len(loose) <= MAX_LOOSE else []), points

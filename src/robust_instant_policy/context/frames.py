@@ -5,7 +5,8 @@ between cup and saucer" is so in a frame whose origin is at a share of the way f
 the line between them. The words are
 
     frame  = origin, axes [, growth]
-    origin = point of a thing  |  share of the way between points of two things
+    origin = point of a thing  |  share of the way between points of two things, as a whole or along each axis
+             |  shares of the ways from a point of one thing to points of two others
     axes   = a thing's  |  along the line between points of two things, seen from above or in space
     growth = an offset that grows with the size of a thing
 
@@ -14,7 +15,7 @@ where a thing is the world, a keypoint, or keypoints that move together (`things
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -70,27 +71,34 @@ class Axes:
 class Frame:
     """A coordinate system that can be found in any scene.
 
-    Its origin is the only one of ``ends``, or at ``share`` of the way from the first to the second, moved by ``shifts
-    (3,)``, metres, in the axes of each end. ``growth`` are things with the offset ``(3,)``, metres in the frame, by
-    which the origin moves when the thing's size doubles. ``error``, metres, is how far off the demonstrations are when
-    each is predicted from the others (`choose_frames`).
+    Its origin is the first of ``ends``, moved by ``shares (3,)`` of the way to each further end along the frame's axes,
+    and by ``shifts (3,)``, metres, in the axes of each end; the world, as an end, is at ``home (3,)``. ``growth`` are
+    things with the offset ``(3,)``, metres in the frame, by which the origin moves when the thing's size doubles.
+    ``error``, metres, is how far off the demonstrations are when each is predicted from the others (`choose_frames`).
     """
 
     axes: Axes
     ends: tuple[Thing, ...]
     shifts: tuple[FloatArray, ...]
-    share: float = 0.0
+    shares: tuple[FloatArray, ...] = ()
     growth: tuple[tuple[Thing, FloatArray], ...] = ()
+    home: FloatArray = field(default_factory=lambda: np.zeros(3))
     error: float = float("nan")
 
     def __str__(self) -> str:
         if self.things == (WORLD,):
             return "world"
-        origin = str(self.ends[0])
-        if len(self.ends) == 2:
-            origin = f"{self.share:z.0%} of the way from {origin} to {self.ends[1]}"
+        origin = f"{self.way} of the way from {self.ends[0]} to {self.ends[1]}" if self.shares else str(self.ends[0])
+        if len(self.ends) == 3:
+            first, second = map(_percent, self.shares)
+            origin = f"{first} of the way from {self.ends[0]} to {self.ends[1]} and {second} to {self.ends[2]}"
         grows = "".join(f", further with the size of {thing}" for thing, _ in self.growth)
         return f"{origin}, {self.axes}{grows}"
+
+    @property
+    def way(self) -> str:
+        """The shares in words."""
+        return " and ".join(map(_percent, self.shares))
 
     @property
     def things(self) -> tuple[Thing, ...]:
@@ -100,11 +108,14 @@ class Frame:
 
     def pose_in(self, scene: Scene) -> FloatArray:
         """The frame's poses ``(I, 4, 4)``."""
-        first, last = scene[self.ends[0]].position, scene[self.ends[-1]].position
-        origin = first + self.share * (last - first)
-        for thing, shift in zip(self.ends, self.shifts, strict=True):
-            origin = origin + scene[thing].rotation @ shift
         rotation = self.axes.rotation(scene)
+        points = [scene[end].position + (self.home if end is WORLD else 0.0) for end in self.ends]
+        origin = points[0]
+        for point, share in zip(points[1:], self.shares, strict=True):
+            along = (point - points[0])[:, None] @ rotation * share
+            origin = origin + (along @ np.swapaxes(rotation, 1, 2))[:, 0]
+        for end, shift in zip(self.ends, self.shifts, strict=True):
+            origin = origin + scene[end].rotation @ shift
         for thing, offset in self.growth:
             origin = origin + (scene[thing].size - 1)[:, None] * (rotation @ offset)
         pose = np.tile(np.eye(4), (len(origin), 1, 1))
@@ -121,3 +132,9 @@ class Frame:
 
 
 WORLD_FRAME = Frame(Axes((Anchor(WORLD, np.zeros(3)),)), (WORLD,), (np.zeros(3),))
+
+
+def _percent(share: FloatArray) -> str:
+    if np.ptp(share) == 0:
+        return f"{share[0]:z.0%}"
+    return ", ".join(f"{axis} {own:z.0%}" for axis, own in zip("xyz", share, strict=True))

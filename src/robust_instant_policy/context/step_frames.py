@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -68,7 +68,7 @@ class StepFrames:
             changes = [step for step in range(1, len(own)) if not own[step].continues(own[step - 1])]
             for start, stop in pairwise([0, *changes, len(own)]):
                 first, last = own[start], own[stop - 1]
-                words = str(last) if first.share == last.share else f"{first.share:z.0%} to {last}"
+                words = str(last) if first.way == last.way else f"{first.way} to {last}"
                 found.append((words, arm, start, stop - 1, poses[stop - 1, arm]))
         return found
 
@@ -80,7 +80,7 @@ class StepFrames:
         """
         ends = {frame.ends for frame in self.used}
         ends |= {tuple(end.thing for end in frame.axes.ends) for frame in self.used}
-        pairs = [own for own in ends if len(own) == 2]
+        pairs = list(dict.fromkeys(pair for own in ends for pair in combinations(own, 2)))
         sizes = {thing for frame in self.used for thing, _ in frame.growth}
         every = np.stack([self.named(points) for points in [*demonstrated, keypoints]])
         scene = locate([thing for own in [*pairs, tuple(sizes)] for thing in own], every)

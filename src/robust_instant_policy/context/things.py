@@ -74,6 +74,12 @@ class Thing:
     def turns(self) -> bool:
         return self.kind not in ("world", "point")
 
+    @property
+    def extent(self) -> float:
+        """The largest distance of two of its keypoints, metres, at a size of 1."""
+        assert self.shape is not None
+        return float(np.linalg.norm(self.shape[:, None] - self.shape, axis=-1).max())
+
 
 @dataclass(frozen=True, eq=False)
 class Located:
@@ -131,7 +137,7 @@ def _located(thing: Thing, keypoints: FloatArray, found: Scene) -> Located:
         ratio = ratio / (np.abs(_complex(thing.shape)) ** 2).sum()
         return Located(rotations_about_vertical(np.angle(ratio)), middle, np.abs(ratio), unit)
     poses, hand, _ = _fit_either_hand(thing.shape, points, thing.kind == "upright", thing.mirrors)
-    return Located(poses[:, :3, :3], poses[:, :3, 3], unit, hand)
+    return Located(poses[:, :3, :3], poses[:, :3, 3], _rms_radius(points) / _rms_radius(thing.shape[None]), hand)
 
 
 def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:

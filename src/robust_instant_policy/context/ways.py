@@ -16,14 +16,13 @@ from operator import attrgetter
 
 import numpy as np
 
-from robust_instant_policy.context.choice import NOISE_M, Candidates, prediction_errors
+from robust_instant_policy.context.choice import NOISE_M, UNEXPLAINED_M, Candidates, prediction_errors
 from robust_instant_policy.context.things import MAX_THINGS, WORLD, Located, Scene, Thing, find_things, locate
 from robust_instant_policy.geometry import FloatArray, fit_upright
 
 RANK_GAIN, SPLIT_GAIN = 1.0, 1.0  # sums of logarithms of the errors at key steps by which an explanation must be better
 LEAST_OF_A_WAY = 2  # demonstrations
 ALIKE_M = 0.006  # largest difference of the shapes of things that are alike
-SINGLE_ERROR_M = 0.015  # where every key step is predicted better than this, all do the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +136,10 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
     """
     demos = len(hands)
     single = _squared(things, scene, hands)
-    if demos < 2 * LEAST_OF_A_WAY or single.max() < SINGLE_ERROR_M**2:
+    if demos < 2 * LEAST_OF_A_WAY or single.max() < UNEXPLAINED_M**2:
+        return None
+    single = np.minimum(single, _least(_errors(things, scene, hands, more_origins=True)[1]))
+    if single.max() < UNEXPLAINED_M**2:
         return None
     arm, step = np.unravel_index(int(single.argmax()), single.shape)
     splits: dict[bytes, list[tuple[Split, np.ndarray, float]]] = {}
@@ -172,9 +174,13 @@ def _squared(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> FloatA
     return _least(_errors(things, scene, hands)[1])
 
 
-def _errors(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tuple[Candidates, list[FloatArray]]:
+def _errors(
+    things: Sequence[Thing], scene: Scene, hands: FloatArray, more_origins: bool = False
+) -> tuple[Candidates, list[FloatArray]]:
     """The candidates, and their mean squared errors ``(T, M, N)`` for each arm."""
     candidates = Candidates.of(things, scene)
+    if more_origins:
+        candidates = candidates.with_more_origins(things)
     return candidates, [prediction_errors(candidates, hands[:, :, arm]).mean_squared for arm in range(hands.shape[2])]
 
 
@@ -250,6 +256,8 @@ def _measures(things: Sequence[Thing]) -> tuple[list[Measure], list[Measure]]:
         if a.mirrors:
             numbers.append(Measure(f"which hand {a} is", (a,), attrgetter("hand")))
     for a, b in combinations(own, 2):
+        if a.turns and b.turns:
+            numbers.append(Measure(f"the size of {a} minus that of {b}", (a, b), partial(_larger, a.extent, b.extent)))
         numbers += [
             Measure(f"{name} of {a} minus that of {b}", (a, b), partial(_difference, place))
             for name, place in _PLACES.items()
@@ -269,6 +277,11 @@ def _measures(things: Sequence[Thing]) -> tuple[list[Measure], list[Measure]]:
 
 def _difference(place: Callable[[Located], FloatArray], at: Located, other: Located) -> FloatArray:
     return place(at) - place(other)
+
+
+def _larger(extent: float, of_other: float, at: Located, other: Located) -> FloatArray:
+    """Metres."""
+    return extent * at.size - of_other * other.size
 
 
 def _far(at: Located) -> FloatArray:

@@ -18,6 +18,7 @@ from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.variant import ROW_METHODS, Scene, Variant
+from robust_instant_policy.geometry import FloatArray
 
 MARKS = ((5e-3, "**"), (5e-2, "*"))  # the paper's, below these p-values
 CONFIDENCE = 0.95
@@ -46,6 +47,16 @@ def scene_interval(mean: float, scenes: int) -> tuple[float, float]:
     middle = (mean + z**2 / (2 * scenes)) / (1 + z**2 / scenes)
     half = z / (1 + z**2 / scenes) * math.sqrt(mean * (1 - mean) / scenes + z**2 / (4 * scenes**2))
     return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def auroc(score: FloatArray, positive: np.ndarray) -> float:
+    """Probability that the ``score (N,)`` of a ``positive (N,)`` case is higher than that of another; ties count half.
+
+    The area under the receiver operating characteristic (Mann and Whitney 1947); NaN where all cases are of one kind.
+    """
+    high, low = score[positive == 1], score[positive == 0]
+    pairs = len(high) * len(low)
+    return float(stats.mannwhitneyu(high, low).statistic / pairs) if pairs else math.nan
 
 
 def mean_and_deviation(rates: Sequence[float]) -> tuple[float, float]:

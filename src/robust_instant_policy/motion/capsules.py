@@ -1,4 +1,4 @@
-"""Arms as capsules, and distances between capsules.
+"""Arms as capsules, and distances between capsules: those of two arms, and those of one arm's own links.
 
 A capsule is the set of points within a radius of a line segment. Each shape of an arm's model is enclosed in one.
 """
@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike
 from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.motion.kinematics import Kinematics
 
+NEIGHBOURS = 1  # joints between two links, up to which they are not checked against each other
+POSES, ALWAYS = 200, 0.95  # random poses, and the share of them in which shapes that overlap by design do so
 LINES = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 SMALLEST = 1e-12  # squared length of a segment, m², below which it is a point
 
@@ -35,6 +37,11 @@ class Capsules:
             other.stop[..., None, :, :],
         )
         return apart - self.radius[:, None] - other.radius
+
+    def between(self, one: np.ndarray, other: np.ndarray) -> FloatArray:
+        """Distances ``(..., P)`` between the surfaces of the capsules with the indices ``one (P,)`` and ``other``."""
+        ends = (self.start[..., one, :], self.stop[..., one, :], self.start[..., other, :], self.stop[..., other, :])
+        return segment_distance(*ends) - self.radius[one] - self.radius[other]
 
     def lowest(self) -> FloatArray:
         """Height ``(..., C)`` of the lowest point of each, metres."""
@@ -67,7 +74,9 @@ class ArmShape:
 
     ``fixed (C,)`` marks the base; ``near_table (C,)`` is False for it and for links that only turn about the arm's
     first joint: they stand on the table;
-    ``hand (C,)`` marks those beyond the last joint, which work at the table.
+    ``hand (C,)`` marks those beyond the last joint, which work at the table. ``links (C,)`` are the links' names, and
+    ``pairs (2, P)`` the capsules of one arm that must not meet: two joints or more lie between their links, and they
+    are apart in some poses, other than shapes that enclose a joint generously.
     """
 
     def __init__(self, kinematics: Kinematics):
@@ -80,6 +89,14 @@ class ArmShape:
         shapes = [_enclosing(model, geom) for geom in range(model.ngeom)]
         self._local = np.array([(start, stop) for start, stop, _ in shapes]).reshape(-1, 2, 3)
         self.radius = np.array([radius for _, _, radius in shapes])
+        self.links = [model.body(body).name for body in model.geom_bodyid]
+        one, other = np.triu_indices(len(depth), 1)
+        distant = np.abs(depth[one] - depth[other]) > NEIGHBOURS
+        one, other = one[distant], other[distant]
+        low, high = kinematics.joint_range.clip(-np.pi, np.pi).T
+        poses = np.random.default_rng(0).uniform(low, high, (POSES, self._num_joints))
+        apart = (self.at(poses).between(one, other) < 0).mean(axis=0) < ALWAYS
+        self.pairs = np.stack([one[apart], other[apart]])
 
     def at(self, joints: ArrayLike) -> Capsules:
         """The capsules ``(N, C)`` in the world at ``joints (N, J)``."""

@@ -102,8 +102,9 @@ class Gate:
     def limited(self, wanted: Sequence[Command]) -> list[Command]:
         """What the arms may do towards ``wanted``: within speeds, accelerations and ranges, or not at all.
 
-        Where the next step, or coming to rest after it, would bring a tool out of the workspace or a link to the table
-        or the other arm, all arms brake. A tool that is outside the workspace comes nearer to it or stays.
+        Where the next step, or coming to rest after it, would bring a tool out of the workspace or a link to the table,
+        to another link or to the other arm, all arms brake. A tool that is outside the workspace comes nearer to it or
+        stays.
         """
         last = np.stack([command.joints for command in self._last])
         joints = np.stack([command.joints for command in wanted])
@@ -151,7 +152,7 @@ class Gate:
             way = last + _stopping(step, self._acceleration)
             try:
                 if (self._space.outside(way) <= most).all():
-                    self._space.check(way, self._rate, to_home=True)
+                    self._space.check(way, self._rate, to_home=True, start=last)
                     return step
             except UnreachableError:
                 continue

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from robust_instant_policy.errors import UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
-from robust_instant_policy.motion.capsules import ArmShape
+from robust_instant_policy.motion.capsules import ArmShape, Capsules
 from robust_instant_policy.motion.checks import gripper_poses
 from robust_instant_policy.motion.limits import Limits, exceeded
 from robust_instant_policy.motion.waypoints import plan_waypoints
@@ -117,17 +117,20 @@ def check_joint_range(joints: FloatArray, arm: Arm, rate_hz: float) -> None:
 
 
 class Space:
-    """Where arms may be: their tools in the workspace, no link at the table, and apart from each other."""
+    """Where arms may be: their tools in the workspace, no link at the table or another link, and the arms apart."""
 
     def __init__(self, arms: Sequence[Arm], limits: Limits):
         self._arms, self._limits = arms, limits
         self._shapes = [ArmShape(arm.kinematics) for arm in arms]
+        self._parked = [shape.at(arm.home) for shape, arm in zip(self._shapes, arms, strict=True)]
 
-    def check(self, joints: FloatArray, rate_hz: float, to_home: bool = False) -> None:
-        """Refuse ``joints (N, A, J)`` with a tool outside the workspace, a link at the table, or two arms together.
+    def check(self, joints: FloatArray, rate_hz: float, to_home: bool = False, start: FloatArray | None = None) -> None:
+        """Refuse ``joints (N, A, J)`` with a tool outside the workspace, a link at the table, or two arms or two links
+        of one arm together.
 
         A tool may come into the workspace from outside, within `HOME_MARGIN_M` of the box around workspace and home;
-        with ``to_home`` it may be anywhere in that box before and after its time in the workspace.
+        with ``to_home`` it may be anywhere in that box before and after its time in the workspace. Links of one arm
+        may be as near to each other as at home, or as at ``start (A, J)``, by default the first of ``joints``.
         """
         limits = self._limits
         capsules = [shape.at(joints[:, index]) for index, shape in enumerate(self._shapes)]
@@ -141,11 +144,27 @@ class Space:
                     "table_depth", rate_hz)  # fmt: skip
             least = shape.height(links)
             _refuse(-least, least, 0.0, arm, "a link has a height above the table of", "m", "model", rate_hz)
+            begun = joints[0, index] if start is None else start[index]
+            self._check_links(index, links, shape.at(begun), rate_hz)
         for one, other in combinations(range(len(self._arms)), 2):
             apart = self._shapes[one].distance(capsules[one], self._shapes[other], capsules[other])
             what = f"its distance from {self._arms[other].name} is"
             _refuse(limits.arm_distance - apart, apart, limits.arm_distance, self._arms[one], what, "m",
                     "arm_distance", rate_hz)  # fmt: skip
+
+    def _check_links(self, index: int, links: Capsules, start: Capsules, rate_hz: float) -> None:
+        """Refuse ``links (N, C)`` of an arm that meet, unless they did so at home or at the ``start``."""
+        shape, limit = self._shapes[index], self._limits.link_distance
+        if not shape.pairs.size:
+            return
+        apart = links.between(*shape.pairs)
+        least = np.minimum(self._parked[index].between(*shape.pairs), start.between(*shape.pairs)).min(axis=0)
+        pair = int(np.argmin((apart - least.clip(max=limit)).min(axis=0)))
+        one, other = (shape.links[capsule] for capsule in shape.pairs[:, pair])
+        what = f"the distance between its links {one} and {other} is"
+        values = apart[:, pair]
+        _refuse(least[pair].clip(max=limit) - values, values, limit, self._arms[index], what, "m", "link_distance",
+                rate_hz)  # fmt: skip
 
     def outside(self, joints: FloatArray) -> FloatArray:
         """How far, metres, each tool is outside the workspace at ``joints (N, A, J)``: ``(N, A)``, 0 inside."""

@@ -14,6 +14,7 @@ from robust_instant_policy.motion.checks import TABLE_TOLERANCE_M
 TURN_PER_STEP_RAD = np.deg2rad(60)
 STEP_M = 0.35
 ARM_DISTANCE_M = 0.02
+LINK_DISTANCE_M = 0.005
 FOLLOWING_ERROR_RAD = 0.35
 
 
@@ -23,7 +24,8 @@ class Limits:
 
     ``workspace (2, 3)``: lower and upper corner, metres, of the box in which fingertips stay;
     ``table_depth``: how deep a fingertip may be commanded below the table, the plane z = 0, metres;
-    ``arm_distance``: least distance between the surfaces of two arms, metres; ``turn_per_step`` rad and ``step``
+    ``arm_distance``, ``link_distance``: least distance between the surfaces of two arms, and of two links of one arm
+    that are not neighbours, metres; ``turn_per_step`` rad and ``step``
     metres: largest change of a tool between two waypoints of a plan; ``following_error`` rad: largest difference
     between a commanded and a measured joint.
     """
@@ -31,6 +33,7 @@ class Limits:
     workspace: FloatArray
     table_depth: float = TABLE_TOLERANCE_M
     arm_distance: float = ARM_DISTANCE_M
+    link_distance: float = LINK_DISTANCE_M
     turn_per_step: float = TURN_PER_STEP_RAD
     step: float = STEP_M
     following_error: float = FOLLOWING_ERROR_RAD

@@ -19,6 +19,7 @@ from robust_instant_policy.perception.objects import (
     MIN_FITNESS,
     Registration,
     RigidObject,
+    certainty,
     find_objects,
     register_all,
     segmentation,
@@ -174,13 +175,13 @@ class KeypointExtractor:
 
     def _locate(self, view: View, registrations: Sequence[Registration]) -> Located:
         """The keypoints of objects with known ``registrations`` in ``view``."""
-        triples = zip(self.objects_, self._places, registrations, strict=True)
+        triples = list(zip(self.objects_, self._places, registrations, strict=True))
         expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
         points, pixels, measured = lift_to_surface(view.observation, view.depth, expected)
         counts = [len(places) for places in self._places]
         confidence = np.repeat([found.score for found in registrations], counts)
         confidence *= np.concatenate(
-            [found.certainty(places) for found, places in zip(registrations, self._places, strict=True)]
+            [certainty(t.model, found, view, places) for t, places, found in triples if len(places)]
         )
         confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / RESIDUAL_M**2)
         confidence[~measured] /= 2

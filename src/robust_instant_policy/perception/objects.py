@@ -13,7 +13,6 @@ from robust_instant_policy.geometry import FloatArray, invert_pose, project, tra
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 from robust_instant_policy.perception.parts import MIN_GAIN, candidate_parts, gain
 from robust_instant_policy.perception.registration import (
-    Candidates,
     Similarity,
     find_rivals,
     fit_shape,
@@ -21,6 +20,7 @@ from robust_instant_policy.perception.registration import (
     rotated,
     settle_turn,
     vote_for_motions,
+    within,
 )
 from robust_instant_policy.perception.view import MIN_OBJECT_M2, TARGET_M, UNRELATED, View, spread_out, subsample
 
@@ -39,7 +39,6 @@ SHAPE_REACH_M = 0.03  # from an object: greatest distance of points of a larger 
 SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
 MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
 PART_TURNS = np.deg2rad(np.arange(-60.0, 90.0, 30.0))  # of a part against its object
-FAMILY_TURNS = np.zeros(1)  # of an object against itself with its parts
 MUCH_BETTER = 0.05  # of the score, by which an object's own registration overrules that with its parts
 MAX_PART_TRAVEL_M = 0.2
 TOUCH_M = 0.03
@@ -51,15 +50,13 @@ MAX_SHARED = 0.3  # of the points that an object explains, with a better registe
 class Registration:
     """An object in an image: ``pose (4, 4)`` from the reference image's world to the image's, after the change of size
     ``shape (4, 4)`` (`fit_shape`), together ``motion (4, 4)``; ``fitness`` of its
-    points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones;
-    ``rivals``: other motions that explain the image, the pose's own score first.
+    points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones.
     """
 
     pose: FloatArray
     fitness: float
     similarity: float
     template: int
-    rivals: Candidates | None = None
     shape: FloatArray = field(default_factory=lambda: np.eye(4))
 
     @property
@@ -70,18 +67,8 @@ class Registration:
     def score(self) -> float:
         return (self.fitness + self.similarity) / 2
 
-    def certainty(self, points: FloatArray) -> FloatArray:
-        """Share ``(N,)``, in [0, 1], of the motions, weighted by how well they explain the image, that put ``points
-        (N, 3)`` of the reference image where this one does.
-        """
-        if self.rivals is None or not len(points):
-            return np.ones(len(points))
-        weights = np.exp(np.minimum(self.rivals.score - self.rivals.score[0], 0) / RIVAL_SCALE)
-        places = points @ np.swapaxes(self.rivals.motions[:, :3, :3], 1, 2) + self.rivals.motions[:, None, :3, 3]
-        same = np.linalg.norm(places - places[0], axis=2) < SAME_PLACE_M
-        return (weights[:, None] * same).sum(axis=0) / weights.sum()
 
-
+NO_MOTIONS = np.zeros((0, 4, 4))
 IN_REFERENCE = Registration(np.eye(4), 1.0, 1.0, 0)
 
 
@@ -216,10 +203,12 @@ def _shapes(models: Sequence[Model], found: Sequence[Registration], view: View) 
         return []
     points = view.target[:, :3].astype(np.float64)
     owner = _owners(models, [one.pose for one in found], points)
-    return [
-        fit_shape(one.pose, model.points, points[owner == i])
-        for i, (model, one) in enumerate(zip(models, found, strict=True))
-    ]
+    shapes = []
+    for i, (model, one) in enumerate(zip(models, found, strict=True)):
+        moved = transform_points(one.pose, model.points)
+        # What something hides has not changed.
+        shapes.append(fit_shape(one.pose, model.points, np.concatenate([points[owner == i], moved[view.hides(moved)]])))
+    return shapes
 
 
 def _owners(models: Sequence[Model], motions: Sequence[FloatArray], points: FloatArray) -> IntArray:
@@ -261,20 +250,23 @@ def _split(
     in ``views``; None if it is rigid. ``found``: the registrations of the whole.
     """
     motions = [one.pose for one in found]
-    best, split = MIN_GAIN, None
+    best, split = 0.0, None
     for part in candidate_parts(home, piece, views, motions):
         rest_model, part_model = (Model((_template_of(home, piece[which], seed),)) for which in (~part, part))
         pairs = []
         for view, whole in zip(views, found, strict=True):
-            rest = register(rest_model.templates, view, near=whole.pose)
-            taken = _explained([rest_model], [rest], [0])
-            pairs.append((rest, register(part_model.templates, view, taken, rest.pose, PART_TURNS)))
+            rest = register(rest_model.templates, view, starts=whole.pose[None])
+            # What the rest explains, or may explain: what is now where the part hid it.
+            was_hidden = home.hides(transform_points(invert_pose(rest.pose), view.target[:, :3]))
+            taken = np.concatenate([_explained([rest_model], [rest], [0]), view.target[was_hidden, :3]])
+            pairs.append((rest, register(part_model.templates, view, taken, parent=rest.pose)))
         fitness = [own.fitness for _, own in pairs]
         if min(fitness) < MIN_FITNESS or np.median(fitness) < MIN_PART_FITNESS:
             continue
-        gained = gain(home.points[piece[part]], views, motions, [own.pose for _, own in pairs])
-        if gained > best:
-            best, split = gained, (piece[~part], piece[part], pairs)
+        share, metres = gain(home.points[piece[part]], views, motions, [own.pose for _, own in pairs])
+        # Not the largest share, which half of the part has as well as all of it.
+        if share > MIN_GAIN and metres > best:
+            best, split = metres, (piece[~part], piece[part], pairs)
     return split
 
 
@@ -287,28 +279,35 @@ def _complete(
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
         better = [k for k in range(len(models)) if found[i][k].score > found[i][number].score]
         taken = _explained(models, found[i], better)
-        grown = replace(model, templates=tuple(templates))
-        registrations[i] = _register_model(grown, views[i], found[i], taken, registrations[i].pose)
-        templates += _another_template(views[i], registrations[i], templates, seed)
+        grown = [*models[:number], replace(model, templates=tuple(templates)), *models[number + 1 :]]
+        registrations[i] = _register_model(grown, number, views[i], found[i], taken, registrations[i].pose[None])
+        others = _explained(models, found[i], [k for k in range(len(models)) if k != number])
+        templates += _another_template(views[i], registrations[i], templates, others, seed)
     return RigidObject(replace(model, templates=tuple(templates)), tuple(registrations))
 
 
 def _register_model(
-    model: Model,
+    models: Sequence[Model],
+    number: int,
     view: View,
     found: Sequence[Registration] | Mapping[int, Registration],
     taken: FloatArray | None = None,
-    near: FloatArray | None = None,
+    starts: FloatArray = NO_MOTIONS,
 ) -> Registration:
-    """One object: a part near its parent, which was ``found``, and an object with parts where they fit, too."""
+    """Object ``number``: a part near its parent, which was ``found``, and an object with parts where they fit, too."""
+    model = models[number]
     if model.parent >= 0:
-        return register(model.templates, view, taken, found[model.parent].pose, PART_TURNS)
-    if model.family:
-        family = register(model.family, view, taken)
-        found_in_family = register(model.templates, view, taken, family.pose, FAMILY_TURNS, alone=False)
-        found_alone = register(model.templates, view, taken, near)
-        return found_alone if found_alone.score > found_in_family.score + MUCH_BETTER else found_in_family
-    return register(model.templates, view, taken, near)
+        parent = found[model.parent]
+        # In one image parts hide some of their object, in all of them nothing.
+        whole = np.concatenate([template.surface for template in models[model.parent].templates])
+        beside = transform_points(parent.motion, whole)
+        return register(model.templates, view, taken, starts, parent=parent.pose, beside=beside)
+    alone = register(model.templates, view, taken, starts)
+    if not model.family:
+        return alone
+    family = register(model.family, view, taken)
+    in_family = register(model.templates, view, taken, family.pose[None], vote=False)
+    return alone if alone.score > in_family.score + MUCH_BETTER else in_family
 
 
 def register_all(models: Sequence[Model], view: View) -> list[Registration]:
@@ -319,27 +318,29 @@ def register_all(models: Sequence[Model], view: View) -> list[Registration]:
     """
     found: dict[int, Registration] = {}
     for i in sorted(range(len(models)), key=lambda i: models[i].parent >= 0):  # parts come after their objects
-        found[i] = _register_model(models[i], view, found)
-    tree = cKDTree(view.target[:, :3])
+        found[i] = _register_model(models, i, view, found)
+    points = view.target[:, :3].astype(np.float64)
     claims: dict[int, IntArray] = {}  # of those that are settled
     for i in sorted(found, key=lambda i: -found[i].score):
         most = MAX_SHARED if models[i].parent < 0 else MAX_SHARED_BY_PART
-        claimed = _claim(tree, models[i], found[i])
+        claimed = _claim(points, models[i], found[i])
         if _shared(claimed, claims.values()) > most:
             contested = found[i]
-            again = _register_model(models[i], view, found, _explained(models, found, list(claims)))
-            found[i] = max((_apart(tree, models[i], one, claims) for one in (contested, again)), key=lambda r: r.score)
+            again = _register_model(models, i, view, found, _explained(models, found, list(claims)))
+            found[i] = max(
+                (_apart(points, models[i], one, claims) for one in (contested, again)), key=lambda r: r.score
+            )
             # Or does what has the contested points belong somewhere else?
             holders = [k for k in claims if k != models[i].parent and _shared(claimed, [claims[k]]) > most]
             if len(holders) == 1:
                 holder, others = holders[0], {k: claims[k] for k in claims if k != holders[0]}
-                keeping = _apart(tree, models[i], contested, others)
+                keeping = _apart(points, models[i], contested, others)
                 without_both = _explained(models, found | {i: contested}, [*others, i])
-                moved = _register_model(models[holder], view, found, without_both)
+                moved = _register_model(models, holder, view, found, without_both)
                 if keeping.score + moved.score > found[i].score + found[holder].score:
                     found |= {i: keeping, holder: moved}
-                    claims[holder] = _claim(tree, models[holder], moved)
-        claims[i] = _claim(tree, models[i], found[i])
+                    claims[holder] = _claim(points, models[holder], moved)
+        claims[i] = _claim(points, models[i], found[i])
     result = [found[i] for i in range(len(models))]
     if not any(model.varies for model in models):
         return result
@@ -355,11 +356,10 @@ def _explained(
     return np.concatenate([np.zeros((0, 3)), *moved])
 
 
-def _claim(tree: cKDTree, model: Model, found: Registration) -> IntArray:
-    """Numbers of the points in ``tree`` that an object explains."""
+def _claim(points: FloatArray, model: Model, found: Registration) -> IntArray:
+    """Numbers of the ``points (N, 3)`` of an image that an object explains."""
     moved = transform_points(found.motion, model.templates[found.template].surface)
-    near = tree.query_ball_point(moved, CLAIM_M)
-    return np.unique(np.concatenate([np.asarray(one, dtype=np.intp) for one in near]))
+    return np.flatnonzero(within(points, moved, CLAIM_M))
 
 
 def _shared(claimed: IntArray, claims: Iterable[IntArray]) -> float:
@@ -369,17 +369,22 @@ def _shared(claimed: IntArray, claims: Iterable[IntArray]) -> float:
     )
 
 
-def _apart(tree: cKDTree, model: Model, found: Registration, claims: Mapping[int, IntArray]) -> Registration:
+def _apart(points: FloatArray, model: Model, found: Registration, claims: Mapping[int, IntArray]) -> Registration:
     """``found``, whose fitness counts only for points that are in no other object's ``claims``."""
-    return replace(found, fitness=found.fitness * (1 - _shared(_claim(tree, model, found), claims.values())))
+    return replace(found, fitness=found.fitness * (1 - _shared(_claim(points, model, found), claims.values())))
 
 
-def _another_template(view: View, found: Registration, templates: Sequence[Template], seed: int) -> list[Template]:
-    """The object as ``view`` shows it, or nothing where it does not."""
+def _another_template(
+    view: View, found: Registration, templates: Sequence[Template], others: FloatArray, seed: int
+) -> list[Template]:
+    """The object as ``view`` shows it, apart from what is nearer to ``others (T, 3)``, or nothing where it does not."""
     to_reference = np.asarray(np.linalg.inv(found.motion), dtype=np.float64)
     known = templates[found.template].xyzrgb
     points = transform_points(to_reference, view.target[:, :3])
-    same = cKDTree(known[:, :3]).query(points)[0] < SAME_OBJECT_M
+    distance = cKDTree(known[:, :3]).query(points)[0]
+    same = distance < SAME_OBJECT_M
+    if len(others):
+        same &= distance <= cKDTree(others).query(view.target[:, :3])[0]
     if not same.any():
         return []
     seen = np.concatenate([points, view.target[:, 3:]], axis=1)[same].astype(np.float32)
@@ -408,40 +413,61 @@ def register(
     templates: Sequence[Template],
     view: View,
     taken: FloatArray | None = None,
-    near: FloatArray | None = None,
-    turns: FloatArray | None = None,
-    alone: bool = True,
+    starts: FloatArray = NO_MOTIONS,
+    vote: bool = True,
+    parent: FloatArray | None = None,
+    beside: FloatArray | None = None,
 ) -> Registration:
     """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world.
 
-    ``near (4, 4)``: another motion to start from. With ``turns (A,)`` it is turned by these, and those from elsewhere
-    are left out; unless ``alone``, all others are.
+    From the motions ``starts (S, 4, 4)``, and unless ``vote`` is false from those of matches. A part also starts from
+    turns of the pose ``parent (4, 4)`` of its object, and from matches apart from that object's points
+    ``beside (B, 3)``, and stays near it.
     """
     target, free = view.target, np.arange(len(view.cell_points))
     if taken is not None and len(taken):
-        others = cKDTree(taken)
-        target = target[others.query(target[:, :3], distance_upper_bound=CLAIM_M)[0] > CLAIM_M]
-        free = np.flatnonzero(others.query(view.cell_points, distance_upper_bound=CLAIM_M)[0] > CLAIM_M)
+        target = target[~within(target[:, :3], taken, CLAIM_M)]
+        free = np.flatnonzero(~within(view.cell_points, taken, CLAIM_M))
         if len(target) < MIN_TARGET_POINTS or not len(free):
             return Registration(np.eye(4), 0.0, 0.0, 0)
-    similar = [t.view.descriptors.similarities(t.cells, view.descriptors, view.cells) for t in templates]
+    similar = _similarities(templates, view)
     with_foreground = [table[:, free] for table in similar]
+    matches, goals = np.concatenate(with_foreground), view.cell_points[free]
     points = np.concatenate([template.points for template in templates])
-    motions = np.zeros((0, 4, 4))
-    if alone:
-        motions = vote_for_motions(points, view.cell_points[free], np.concatenate(with_foreground))
-    if near is not None:
-        centre = points.mean(axis=0)
-        motions = np.concatenate([rotated(near, centre, np.zeros(1) if turns is None else turns), motions])
-        if turns is not None:
-            travel = motions[:, :3, :3] @ centre + motions[:, :3, 3] - transform_points(near, centre)
-            motions = motions[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
+    centre = points.mean(axis=0)
+    motions = [starts]
+    if parent is not None:
+        motions.append(rotated(parent, centre, PART_TURNS))
+    if vote:
+        motions.append(vote_for_motions(points, goals, matches))
+    if beside is not None and (apart := ~within(goals, beside, CLAIM_M)).any():
+        motions.append(vote_for_motions(points, goals[apart], matches[:, apart]))
+    candidates = np.concatenate(motions)
+    if parent is not None:
+        travel = candidates[:, :3, :3] @ centre + candidates[:, :3, 3] - transform_points(parent, centre)
+        candidates = candidates[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
     index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
     source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
-    candidates = refine(motions, source, target, similarity)
-    pose = settle_turn(candidates.motions[0], source, target, similarity)
-    rivals = find_rivals(pose, source, target, similarity)
-    return Registration(pose, float(candidates.fitness[0]), float(candidates.similarity[0]), index, rivals)
+    refined = refine(candidates, source, target, similarity, view.hides)
+    pose = settle_turn(refined.motions[0], source, target, similarity, view.hides)
+    return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index)
+
+
+def certainty(model: Model, found: Registration, view: View, points: FloatArray) -> FloatArray:
+    """Share ``(N,)``, in [0, 1], of the motions, weighted by how well they explain ``view``, that put ``points (N, 3)``
+    of the reference image where ``found`` does.
+    """
+    similarity = _similarity(model.templates, view, _similarities(model.templates, view))
+    rivals = find_rivals(found.pose, model.templates[found.template].xyzrgb, view.target, similarity, view.hides)
+    weights = np.exp(np.minimum(rivals.score - rivals.score[0], 0) / RIVAL_SCALE)
+    places = points @ np.swapaxes(rivals.motions[:, :3, :3], 1, 2) + rivals.motions[:, None, :3, 3]
+    same = np.linalg.norm(places - places[0], axis=2) < SAME_PLACE_M
+    return (weights[:, None] * same).sum(axis=0) / weights.sum()
+
+
+def _similarities(templates: Sequence[Template], view: View) -> list[Float32Array]:
+    """Of the cells of each of ``templates`` and those of ``view``."""
+    return [one.view.descriptors.similarities(one.cells, view.descriptors, view.cells) for one in templates]
 
 
 def _similarity(templates: Sequence[Template], view: View, similar: Sequence[Float32Array]) -> Similarity:

@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
+from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.descriptors import IntArray
 from robust_instant_policy.perception.view import GAP_M, View, connected_pieces
 
 UNEXPLAINED_M = 0.008  # distance from the surfaces of the other images
 PERCENTILE = 75.0  # over the images: a part need not move in all of them
 GREATEST_M = 0.05  # distance that counts
-HIDDEN_M = 0.02  # behind the surface that the image shows there
 SMOOTHING_POINTS = 8
 THIN = 0.5  # of the greatest radius of a circle inside a piece
 MIN_GAIN = 0.4  # of the distances, by a motion of its own
@@ -57,12 +56,15 @@ def _connected(home: View, piece: IntArray, which: BoolArray) -> list[BoolArray]
     return parts
 
 
-def gain(points: FloatArray, views: Sequence[View], whole: Sequence[FloatArray], own: Sequence[FloatArray]) -> float:
-    """Share by which the distances of a part's ``points (N, 3)`` from the surfaces in ``views`` become smaller with its
-    ``own`` motions than with those of the ``whole``; 0 where those explain it.
+def gain(
+    points: FloatArray, views: Sequence[View], whole: Sequence[FloatArray], own: Sequence[FloatArray]
+) -> tuple[float, float]:
+    """By how much the distances of a part's ``points (N, 3)`` from the surfaces in ``views`` become smaller with its
+    ``own`` motions than with those of the ``whole``: as a share, 0 where those explain it, and in all, metres.
     """
-    before = _distances(points, views, whole).mean()
-    return 0.0 if before < MIN_DISTANCE_M else 1 - float(_distances(points, views, own).mean() / before)
+    before, after = (_distances(points, views, motions) for motions in (whole, own))
+    share = 0.0 if before.mean() < MIN_DISTANCE_M else 1 - float(after.mean() / before.mean())
+    return share, float((before - after).sum())
 
 
 def _distances(points: FloatArray, views: Sequence[View], poses: Sequence[FloatArray]) -> FloatArray:
@@ -75,12 +77,10 @@ def _distances(points: FloatArray, views: Sequence[View], poses: Sequence[FloatA
         moved = transform_points(pose, points)
         distances[row] = np.minimum(cKDTree(view.points).query(moved)[0], GREATEST_M)
         camera = view.observation
-        pixels = np.rint(project(moved, camera.intrinsics, camera.camera_pose)).astype(int)
+        pixels = np.rint(project(moved, camera.intrinsics, camera.camera_pose))
         height, width = view.depth.shape
         seen = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-        u, v = pixels.clip(0, (width - 1, height - 1)).T
-        behind = transform_points(invert_pose(camera.camera_pose), moved)[:, 2] - view.depth[v, u]
-        distances[row, ~seen | (behind > HIDDEN_M)] = np.nan
+        distances[row, ~seen | view.hides(moved)] = np.nan
     known = np.isfinite(distances).any(axis=0)
     typical = np.zeros(len(points))
     typical[known] = np.nanpercentile(distances[:, known], PERCENTILE, axis=0)

@@ -13,7 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from robust_instant_policy.geometry import (
@@ -40,9 +41,11 @@ OWN_REACH_M = 0.04  # image points further from the object belong to others
 RESTART_ANGLES = np.deg2rad([0.0, -25.0, 25.0])
 COARSE_POINTS = 60
 FINALISTS = 3
+SAME_SHIFT_M, SAME_TURN_RAD = 0.005, np.deg2rad(5.0)  # between motions that ICP brings to one
 COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)  # kernel width in each iteration
 FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
 LOCAL_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
+HIDDEN_WEIGHT = 0.5  # of a point that something hides, which counts as one without a match, beside one that is seen
 MIN_WEIGHT = np.float32(1e-9)  # keeps the weights' sum above zero
 # Symmetry and rivals.
 SMALL_TURNS = np.deg2rad(np.arange(-20.0, 25.0, 5.0))  # the middle one is none
@@ -61,6 +64,7 @@ MIN_EXTENT_M = 0.01  # flatter things are not stretched
 MAX_STRETCH = 1.4
 
 Similarity = Callable[[FloatArray], FloatArray]
+Hidden = Callable[[FloatArray], NDArray[np.bool_]]
 
 
 def vote_for_motions(source: FloatArray, target: FloatArray, similarities: Float32Array) -> FloatArray:
@@ -81,8 +85,9 @@ def vote_for_motions(source: FloatArray, target: FloatArray, similarities: Float
     shifts = (q - p @ np.swapaxes(rotations, 1, 2))[..., :2]
     bins = np.floor((shifts - shifts.min(axis=(0, 1))) / SHIFT_BIN_M).astype(np.intp) + 1
     shape = (ANGLE_BINS, *(bins.max(axis=(0, 1)) + 2))
-    votes = np.zeros(shape)
-    np.add.at(votes, (np.arange(ANGLE_BINS)[:, None], bins[..., 0], bins[..., 1]), weights)
+    at = np.ravel_multi_index((np.arange(ANGLE_BINS)[:, None], bins[..., 0], bins[..., 1]), shape)
+    total = np.bincount(at.reshape(-1), np.tile(weights, ANGLE_BINS), int(np.prod(shape)))
+    votes = total.astype(np.float32).reshape(shape)
     for axis in range(3):  # a motion near the border of a bin has its votes in two
         votes = votes + np.roll(votes, 1, axis) + np.roll(votes, -1, axis)
     motions: list[FloatArray] = []
@@ -112,28 +117,37 @@ class Candidates:
         return (self.fitness + self.similarity) / 2
 
 
-def refine(motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> Candidates:
+def refine(
+    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+) -> Candidates:
     """The best candidates after ICP from ``motions (P, 4, 4)``.
 
     ``source (N, 6)`` and ``target (M, 6)`` are XYZRGB points; ``similarity`` is that of the descriptors under each of
-    several motions. A subset of the points selects `FINALISTS`, all points order them.
+    several motions, ``hidden`` tells which places ``(..., 3)`` of points something hides. A subset of the points
+    selects `FINALISTS`, all points order them.
     """
     centre = source[:, :3].mean(axis=0)
     starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
-    starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M)
-    leading = np.argsort(-fitness - similarity(starts))[:FINALISTS]
-    finalists, fitness = icp(starts[leading], source, _around(starts[leading], source, target), FINE_REACH_M)
+    starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M, hidden)
+    leading = _distinct(starts, centre, np.argsort(-fitness - similarity(starts), kind="stable"))[:FINALISTS]
+    refined = [
+        icp(start, source, _near(start, source, _around(start, source, target)), FINE_REACH_M, hidden)
+        for start in starts[leading][:, None]
+    ]
+    finalists, fitness = (np.concatenate(parts) for parts in zip(*refined, strict=True))
     similarities = similarity(finalists)
     order = np.argsort(-fitness - similarities, kind="stable")
     return Candidates(finalists[order], fitness[order], similarities[order])
 
 
-def settle_turn(motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> FloatArray:
+def settle_turn(
+    motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+) -> FloatArray:
     """``motion (4, 4)``, turned to the descriptors' mean rotation if points do not determine it, as for a disc."""
     centre = source[:, :3].mean(axis=0)
     alternatives = rotated(motion, centre, SMALL_TURNS)
     target = _around(motion[None], source, target)
-    fitness = icp(alternatives, *_coarse(source, target), ())[1]
+    fitness = icp(alternatives, *_coarse(source, target), (), hidden)[1]
     if fitness.min() <= fitness[len(alternatives) // 2] - MAX_SYMMETRY_LOSS:
         return motion
     likelihood = similarity(alternatives)
@@ -141,16 +155,18 @@ def settle_turn(motion: FloatArray, source: Float32Array, target: Float32Array, 
     return rotated(motion, centre, np.atleast_1d(share @ SMALL_TURNS / share.sum()))[0]
 
 
-def find_rivals(motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity) -> Candidates:
+def find_rivals(
+    motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+) -> Candidates:
     """``motion (4, 4)`` itself, and that turned by `LARGE_TURNS` or slid by `SLIDES_M`, measured with a subset."""
     centre = source[:, :3].mean(axis=0)
     turned = rotated(motion, centre, LARGE_TURNS)
     slid = np.repeat(motion[None], len(SLIDES_M), axis=0)
     slid[:, :3, 3] += SLIDES_M
     coarse = _coarse(source, _around(motion[None], source, target))
-    turned = icp(turned, *coarse, RIVAL_REACH_M)[0]
+    turned = icp(turned, *coarse, RIVAL_REACH_M, hidden)[0]
     motions = np.concatenate([motion[None], turned, slid])
-    return Candidates(motions, icp(motions, *coarse, ())[1], similarity(motions))
+    return Candidates(motions, icp(motions, *coarse, (), hidden)[1], similarity(motions))
 
 
 def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
@@ -191,6 +207,33 @@ def _around(motions: FloatArray, source: Float32Array, target: Float32Array) -> 
     return target[near] if near.any() else target[:1]
 
 
+def _distinct(motions: FloatArray, centre: FloatArray, order: IntArray) -> list[int]:
+    """Those numbers in ``order`` of ``motions (C, 4, 4)`` of a thing at ``centre (3,)`` that differ from all before."""
+    kept: list[int] = []
+    places = motions[:, :3, :3] @ centre + motions[:, :3, 3]
+    for i in order:
+        shifts = np.linalg.norm(places[kept] - places[i], axis=1)
+        turns = np.linalg.norm(motions[kept, :3, :3] - motions[i, :3, :3], axis=(1, 2)) / np.sqrt(2)
+        if not ((shifts < SAME_SHIFT_M) & (turns < SAME_TURN_RAD)).any():
+            kept.append(int(i))
+    return kept
+
+
+def _near(motions: FloatArray, source: Float32Array, target: Float32Array) -> Float32Array:
+    """Those of ``target (M, 6)`` that ``source (N, 6)`` may reach at ``motions (C, 4, 4)``; at least one."""
+    places = source[:: max(1, len(source) // COARSE_POINTS), :3] @ np.swapaxes(motions[:, :3, :3], 1, 2)
+    near = within(target[:, :3], (places + motions[:, None, :3, 3]).reshape(-1, 3), max(COARSE_REACH_M))
+    return target[near] if near.any() else target[:1]
+
+
+def within(points: ArrayLike, others: FloatArray, distance: float) -> NDArray[np.bool_]:
+    """Which of ``points (N, 3)`` are nearer than ``distance`` to one of ``others (M, 3)``."""
+    points = np.asarray(points, dtype=np.float64)
+    near = ((points > others.min(axis=0) - distance) & (points < others.max(axis=0) + distance)).all(axis=1)
+    near[near] = cKDTree(others).query(points[near], distance_upper_bound=distance)[0] < distance
+    return near
+
+
 def _coarse(source: Float32Array, target: Float32Array) -> tuple[Float32Array, Float32Array]:
     """A subset of both."""
     return source[:: max(1, len(source) // COARSE_POINTS)], target[:: max(1, len(target) // (3 * COARSE_POINTS))]
@@ -205,30 +248,42 @@ def rotated(motion: FloatArray, centre: FloatArray, angles: FloatArray) -> Float
 
 
 def icp(
-    motions: FloatArray, source: Float32Array, target: Float32Array, reaches: tuple[float, ...]
+    motions: FloatArray, source: Float32Array, target: Float32Array, reaches: tuple[float, ...], hidden: Hidden
 ) -> tuple[FloatArray, FloatArray]:
     """``motions (C, 4, 4)`` after one ICP iteration for each of ``reaches`` (kernel widths, metres), and their fitness.
 
     Matches go both ways: an object shifted along itself still covers most of its image points, and only those left
-    uncovered show the error. The fitness in [0, 1] is the geometric mean of both ways.
+    uncovered show the error. The fitness in [0, 1] is the geometric mean of both ways. Points that are ``hidden`` count
+    less.
     """
-    source_xyz, target_xyz = np.ascontiguousarray(source[:, :3]), np.ascontiguousarray(target[:, :3])
-    constant = colour_costs(source, target) + (target_xyz**2).sum(axis=1)
-    linear = np.ascontiguousarray(-2 * target_xyz.T)
+    source_xyz, target_xyz = (points[:, :3].astype(np.float64) for points in (source, target))
+    colours = colour_costs(source, target)
+    origin = target_xyz.mean(axis=0)  # near the points, for the precision of the squares
+    goals = target_xyz - origin
+    quadratic = np.stack([*(-2 * goals.T), (goals**2).sum(axis=1), np.ones(len(goals))]).astype(np.float32)
     costs = np.empty((len(motions), len(source), len(target)), dtype=np.float32)  # reused: allocation is slow
+    numbered = np.empty(costs.shape, dtype=np.int32)
+    last_bits = (1 << (len(source) - 1).bit_length()) - 1
+    cost_bits = 0x7FFFFFFF & ~last_bits  # without the sign: by rounding, a cost may be below zero
+    numbers = np.arange(len(source), dtype=np.int32)[:, None]
 
     def match(motions: FloatArray) -> tuple[IntArray, IntArray, Float32Array, Float32Array, NDArray[np.bool_]]:
         """Nearest targets of the sources, nearest sources of the targets, both squared distances, and which targets
         are near enough to belong to the object.
         """
-        moved = (source_xyz @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]).astype(np.float32)
-        np.matmul(moved, linear, out=costs)
-        np.add(costs, constant, out=costs)
-        np.add(costs, np.einsum("cnx,cnx->cn", moved, moved)[..., None], out=costs)
-        targets, sources = costs.argmin(axis=2), costs.argmin(axis=1)
+        moved = source_xyz @ np.swapaxes(motions[:, :3, :3], 1, 2) + (motions[:, None, :3, 3] - origin)
+        squares = np.einsum("cnx,cnx->cn", moved, moved)[..., None]
+        terms = np.concatenate([moved, np.ones_like(squares), squares], axis=2).astype(np.float32)
+        np.matmul(terms, quadratic, out=costs)
+        np.add(costs, colours, out=costs)
+        targets = costs.argmin(axis=2)
         to_target = np.take_along_axis(costs, targets[..., None], axis=2)[..., 0]
-        to_source = np.take_along_axis(costs, sources[:, None], axis=1)[:, 0]
-        return targets, sources, to_target, to_source, to_source < OWN_REACH_M**2
+        # Along this axis min is several times faster than argmin, so the last bits of a cost are the source's number.
+        np.bitwise_and(costs.view(np.int32), cost_bits, out=numbered)
+        np.bitwise_or(numbered, numbers, out=numbered)
+        least = numbered.min(axis=1)
+        to_source = (least & cost_bits).view(np.float32)
+        return targets, least & last_bits, to_target, to_source, to_source < OWN_REACH_M**2
 
     every_source, every_target = (
         np.broadcast_to(points, (len(motions), *points.shape)) for points in (source_xyz, target_xyz)
@@ -243,7 +298,9 @@ def icp(
         )
     _, _, to_target, to_source, own = match(motions)
     covered = (own * np.exp(-to_source / RESIDUAL_M**2)).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
-    return motions, np.sqrt(np.exp(-to_target / RESIDUAL_M**2).mean(axis=1) * covered)
+    seen = ~hidden(source_xyz @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3])
+    matched = (seen * np.exp(-to_target / RESIDUAL_M**2)).sum(axis=1) / np.where(seen, 1, HIDDEN_WEIGHT).sum(axis=1)
+    return motions, np.sqrt(matched * covered)
 
 
 def colour_costs(source: Float32Array, target: Float32Array) -> Float32Array:

@@ -68,8 +68,9 @@ def _events(points: Sequence[FloatArray], path: Trajectory) -> FloatArray:
 def _relevance(points: Sequence[FloatArray], hands: FloatArray) -> float:
     """Of an object with ``points (N, 3)`` in each of I demonstrations, for the hand's places ``hands (I, E, 3)``."""
     centres = np.array([one.mean(axis=0) for one in points])
-    distance = np.median([cKDTree(one).query(at)[0] for one, at in zip(points, hands, strict=True)], axis=0)
-    near = np.exp(-((distance / CONTACT_M) ** 2))
+    distances = np.array([cKDTree(one).query(at)[0] for one, at in zip(points, hands, strict=True)])
+    near = np.exp(-((distances / CONTACT_M) ** 2)).mean(axis=0)  # what only some demonstrations grasp matters, too
+    distance = np.median(distances, axis=0)
     spread = hands.var(axis=0).sum(axis=-1)
     left = (hands - centres[:, None]).var(axis=0).sum(axis=-1)
     explained = np.where(spread > MIN_SPREAD_M**2, 1 - left / np.maximum(spread, MIN_SPREAD_M**2), 0)

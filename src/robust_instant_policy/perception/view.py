@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import binary_dilation, distance_transform_edt, uniform_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError
-from robust_instant_policy.geometry import FloatArray, invert_pose, lift
+from robust_instant_policy.geometry import FloatArray, invert_pose, lift, project
 from robust_instant_policy.perception.descriptors import (
     NEIGHBOURS,
     DescriptorMap,
@@ -42,6 +42,9 @@ COLOUR_NOISE = 0.02  # standard deviation of the camera's noise in a colour chan
 GAP_M = 0.015  # foreground points further apart in space belong to different pieces,
 GAP_PX = 3  # but those of pixels this near do not,
 HIDDEN_GAP_M = 0.020  # nor those of such pixels this near in a horizontal direction: sides may be hidden from above
+HIDDEN_M = 0.02  # behind the surface that the image shows there
+STRIP_M = 0.035  # that an arm or a rod above the table may hide between two pieces of one thing
+SAME_COLOUR = 0.2  # greatest difference of the mean colours of such pieces, of a range of 1
 MIN_TOLD_SHARE = 1 / 3  # of the size of an object: smaller pieces are noise
 MAX_TOLD = 3
 TARGET_M = 0.005  # edge of the cubes with one point each in `View.target`
@@ -96,6 +99,15 @@ class View:
     stride: int
     least: int
     notes: tuple[str, ...]
+
+    def hides(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Which of ``points (..., 3)``, metres, world, lie behind a surface that the image shows."""
+        camera = self.observation
+        pixels = np.rint(project(points, camera.intrinsics, camera.camera_pose))
+        height, width = self.depth.shape
+        u, v = (pixels[..., axis].clip(0, size - 1).astype(np.intp) for axis, size in enumerate((width, height)))
+        axis = camera.camera_pose[:3, 2]
+        return (points - camera.camera_pose[:3, 3]) @ axis - self.depth[v, u] > HIDDEN_M
 
     @property
     def shows_hand(self) -> bool:
@@ -177,7 +189,9 @@ def make_view(
     label[foreground] = connected_pieces(points[foreground], max(GAP_M, GAP_PX * stride * pixel_m))
     _join_hidden(label, points, usable)
     label[(label >= 0) & np.isin(label, label[of_hand])] = HAND
-    small = _leave_out(label, heights, pixels, least)
+    _leave_out_arms(label, heights, pixels)
+    _join_behind(label, points, usable, observation.rgb[pixels[:, 1], pixels[:, 0]] / 255)
+    small = _leave_out_small(label, heights, pixels, least)
 
     kept = np.flatnonzero(label >= 0)
     if not len(kept):
@@ -312,28 +326,57 @@ def _join_hidden(label: IntArray, points: FloatArray, usable: NDArray[np.bool_])
     label[label >= 0] = connected_components(graph, directed=False)[1][label[label >= 0]]
 
 
-def _leave_out(label: IntArray, heights: FloatArray, pixels: IntArray, least: int) -> str:
-    """Mark in ``label (N,)`` the pieces of fewer than ``least`` points or that reach in over the border; number the
-    others from 0.
+def _leave_out_arms(label: IntArray, heights: FloatArray, pixels: IntArray) -> None:
+    """Mark in ``label (N,)`` the pieces that reach in over the border."""
+    first, last = pixels.min(axis=0), pixels.max(axis=0)
+    margin = np.maximum((last - first) * BORDER_SHARE, 1)
+    crossing = ((pixels < first + margin) | (pixels > last - margin)).any(axis=1) & (label >= 0)
+    for piece in np.unique(label[crossing]):
+        if heights[crossing & (label == piece)].min() > HOVERING_M:
+            label[label == piece] = BORDER
+
+
+def _join_behind(label: IntArray, points: FloatArray, usable: NDArray[np.bool_], colours: FloatArray) -> None:
+    """Join the pieces in ``label (N,)`` of one of ``colours (N, 3)`` that are apart only where something that is above
+    the table hides what is between them.
+
+    ``points (N, 3)`` are those of the ``usable (h, w)`` pixels.
+    """
+    grid = np.full(usable.shape, UNKNOWN)
+    grid[usable] = label
+    number = np.full(usable.shape, -1)
+    number[usable] = np.arange(len(points))
+    above = binary_dilation(np.isin(grid, (BORDER, HIGH, HAND)), iterations=GAP_PX) & (grid < 0)
+    if not above.any() or not (grid >= 0).any():
+        return
+    nearest = number[tuple(distance_transform_edt(grid < 0, return_distances=False, return_indices=True))]
+    mean = {piece: colours[label == piece].mean(axis=0) for piece in np.unique(label[label >= 0])}
+    pairs = []
+    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        between = above[a] & above[b]
+        one, other = nearest[a][between], nearest[b][between]
+        near = (label[one] != label[other]) & (np.linalg.norm(points[one] - points[other], axis=1) < STRIP_M)
+        pairs.append(np.stack([label[one[near]], label[other[near]]], axis=1))
+    alike = [(a, b) for a, b in np.unique(np.concatenate(pairs), axis=0) if abs(mean[a] - mean[b]).max() < SAME_COLOUR]
+    if alike:
+        a, b = np.transpose(alike)
+        count = label.max() + 1
+        graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
+        label[label >= 0] = connected_components(graph, directed=False)[1][label[label >= 0]]
+
+
+def _leave_out_small(label: IntArray, heights: FloatArray, pixels: IntArray, least: int) -> str:
+    """Mark in ``label (N,)`` the pieces of fewer than ``least`` points; number the others from 0.
 
     Returns a line that tells where things are that are too small, or nothing.
     """
-    first, last = pixels.min(axis=0), pixels.max(axis=0)
-    margin = np.maximum((last - first) * BORDER_SHARE, 1)
-    at_border = ((pixels < first + margin) | (pixels > last - margin)).any(axis=1)
     number, small = 0, []
     for piece in np.unique(label[label >= 0]):
         members = np.flatnonzero(label == piece)
         if MIN_TOLD_SHARE * least <= len(members) < least and heights[members].min() > 0:
             small.append("({:.0f}, {:.0f})".format(*pixels[members].mean(axis=0)))
-        crossing = heights[members][at_border[members]]
-        if len(members) < least:
-            label[members] = SMALL
-        elif len(crossing) and crossing.min() > HOVERING_M:
-            label[members] = BORDER
-        else:
-            label[members] = number
-            number += 1
+        label[members] = SMALL if len(members) < least else number
+        number += len(members) >= least
     if not small:
         return ""
     return (

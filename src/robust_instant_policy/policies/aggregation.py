@@ -92,11 +92,12 @@ def make_plan(
     trajectory = Trajectory(chosen.actions, chosen.times)
     outside = context.report.envelope.check(trajectory) if context.report.envelope is not None else ()
     findings = (*context.report.findings, *scene.findings, *outside)
+    best, worst = prediction(context.prediction_errors)
     evidence = Evidence(
         agreement=chosen.confidence,
         vote=context.prompt.vote(scene.keypoints),
         distortion=distortion(context.keypoints, scene.keypoints),
-        prediction=prediction(context.prediction_errors),
+        prediction=best,
         novelty=novelty(context.keypoints, scene.keypoints),
         displacement=context.surroundings.displacement(scene.view, chosen.actions) if scene.view else float("nan"),
         precision=context.surroundings.precision,
@@ -104,6 +105,7 @@ def make_plan(
         warnings=sum(finding.severity == "warning" for finding in findings) - doubts(findings),
         errors=len(errors(findings)),
         undecided=undecided(findings),
+        unexplained=worst,
     )
     unknown = evidence.unknown_notes if judged else ()
     beside = (evidence.displacement_note,) if evidence.features()["displacement"] else ()

@@ -4,8 +4,9 @@
 
 The features f_j are made from `Evidence` and are 0 where nothing speaks against the plan; the coefficients were fitted
 to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A
-plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, or the
-checks could not decide whether images and paths belong together, it is at most `UNKNOWN`.
+plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, do not
+predict each other, a thing has another shape than theirs, or the checks could not decide whether images and paths
+belong together, it is at most `UNKNOWN`.
 """
 
 from __future__ import annotations
@@ -36,6 +37,10 @@ UNDECIDED_NOTE = (
     f"the confidence is at most {UNKNOWN}"
 )
 
+DISTORTED = 3.0  # `Evidence.distortion` above which a thing is another one than was demonstrated, or found wrongly
+
+UNEXPLAINED_M = 0.06  # `Evidence.unexplained` above which it is not known what demonstrations have in common
+
 RECOGNISED = 0.8  # of the least confidence among demonstrations, from which on a scene counts as recognised
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
 # Up to these values evidence says nothing: sound scenes have them.
@@ -59,10 +64,11 @@ class Evidence:
     ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``vote`` in [0, 1] for the way to act
     that was followed, 0 where either of two may be meant (`Prompt.vote`); ``distortion`` of the distances between
     keypoints (see `distortion`); ``prediction``, metres, the error with which demonstrations predict each other at the
-    key step at which they do so best (see `prediction`); ``novelty``, how far the scene lies from the demonstrations
-    (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and ``precision``, that
-    of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording (`doubts`), other
-    ``warnings``, and ``errors``, and how many warnings leave images and paths ``undecided`` (`undecided`).
+    key step at which they do so best, and ``unexplained``, that at which they do so worst; ``novelty``, how far the
+    scene lies from the demonstrations (see `novelty`); ``displacement``, metres, of the plan against what lies around
+    the gripper, and ``precision``, that of the demonstrations (`Surroundings`); how many findings are ``doubts`` about
+    the recording (`doubts`), other ``warnings``, and ``errors``, and how many warnings leave images and paths
+    ``undecided`` (`undecided`).
     """
 
     agreement: float
@@ -76,12 +82,27 @@ class Evidence:
     warnings: int
     errors: int
     undecided: int = 0
+    unexplained: float = float("nan")
 
     @property
     def unknown_notes(self) -> tuple[str, ...]:
         """Why nothing is known of the plan's chance; empty where something is."""
-        predicted = np.isfinite(self.prediction) and np.isfinite(self.novelty)
-        return (*(() if predicted else (UNKNOWN_NOTE,)), *((UNDECIDED_NOTE,) if self.undecided > 0 else ()))
+        distorted = (
+            f"warning: the keypoints of a thing lie {self.distortion:.1f} times farther from its demonstrated shape "
+            f"than usual ({DISTORTED:.0f} are accepted): is it another thing? the confidence is at most {UNKNOWN}"
+        )
+        unexplained = (
+            "warning: at a gripper change the demonstrations predict each other only to "
+            f"{self.unexplained * 1e3:.0f} mm ({UNEXPLAINED_M * 1e3:.0f} mm are accepted): what they have in common "
+            f"there was not found; the confidence is at most {UNKNOWN}"
+        )
+        reasons = {
+            UNKNOWN_NOTE: not (np.isfinite(self.prediction) and np.isfinite(self.novelty)),
+            UNDECIDED_NOTE: self.undecided > 0,
+            distorted: self.distortion > DISTORTED,
+            unexplained: self.unexplained > UNEXPLAINED_M,
+        }
+        return tuple(note for note, holds in reasons.items() if holds)
 
     @property
     def displacement_note(self) -> str:
@@ -124,14 +145,15 @@ def undecided(findings: Sequence[Finding]) -> int:
     return sum(f.severity == "warning" and f.kind == "contact" for f in findings)
 
 
-def prediction(errors: FloatArray) -> float:
-    """Metres, from the errors ``(I, S)`` of `leave_one_out`: the median over the demonstrations at the best key step.
+def prediction(errors: FloatArray) -> tuple[float, float]:
+    """Metres, from the errors ``(I, S)`` of `leave_one_out`: the median over the demonstrations at the best and at the
+    worst key step.
 
-    The best, because demonstrators are precise where the gripper meets a thing and vary freely elsewhere. The first and
-    the last step count only where there are no others.
+    The best tells how precise demonstrators are where the gripper meets a thing; elsewhere they vary freely, but not by
+    any amount. The first and the last step count only where there are no others.
     """
-    between = errors[:, 1:-1] if errors.shape[1] > 2 else errors
-    return float(np.median(between, axis=0).min())
+    between = np.median(errors[:, 1:-1] if errors.shape[1] > 2 else errors, axis=0)
+    return float(between.min()), float(between.max())
 
 
 def novelty(demonstrated: FloatArray, keypoints: FloatArray) -> float:

@@ -117,8 +117,10 @@ def propose(context: Context, scene: LocatedScene, samples: Samples, num_queries
     candidates = tuple(
         prompt.trajectory([own[index].value for own in answers], scene.keypoints) for index in range(count)
     )
-    notes = () if count == num_queries else (f"{count} of {num_queries} answers were usable in time",)
-    return Proposal(candidates, (_cost(samples.seconds, answers),), notes)
+    notes = [] if count == num_queries else [f"{count} of {num_queries} answers were usable in time"]
+    if not answers:
+        notes.append("the language model was not asked: the demonstrations agree on every number of the prompt")
+    return Proposal(candidates, (_cost(samples.seconds, answers),), tuple(notes))
 
 
 def _cost(seconds: float, answers: Sequence[Sequence[Answer]]) -> Stage:

@@ -44,3 +44,11 @@ class Camera(Protocol):
         ...
 
     def disconnect(self) -> None: ...
+
+
+class VideoCamera(Camera, Protocol):
+    """A camera with a live picture."""
+
+    def preview(self) -> NDArray[np.uint8]:
+        """The colour image ``(H, W, 3)`` now, to look at: without depth, filters and checks."""
+        ...

@@ -26,6 +26,7 @@ from robust_instant_policy.motion.checks import TABLE_TOLERANCE_M
 from robust_instant_policy.motion.limits import (
     ARM_DISTANCE_M,
     FOLLOWING_ERROR_RAD,
+    LINK_DISTANCE_M,
     STEP_M,
     TURN_PER_STEP_RAD,
     Limits,
@@ -282,6 +283,7 @@ def _limits(cell: Section) -> Limits:
         workspace,
         table_depth=cell.number("table_depth", TABLE_TOLERANCE_M, 0.0, 0.05),
         arm_distance=cell.number("arm_distance", ARM_DISTANCE_M, 0.0, 1.0),
+        link_distance=cell.number("link_distance", LINK_DISTANCE_M, 0.0, 1.0),
         turn_per_step=math.radians(cell.number("turn_per_step", math.degrees(TURN_PER_STEP_RAD), 1.0, 180.0)),
         step=cell.number("step", STEP_M, 0.01, 2.0),
         following_error=cell.number("following_error", FOLLOWING_ERROR_RAD, 0.01, 2.0),

@@ -25,7 +25,6 @@ from robust_instant_policy.robots.recording import DISCARD, QUIT, demonstration_
 from robust_instant_policy.robots.station import HOLDING, Station
 from robust_instant_policy.sanity import check_demonstrations
 
-PREVIEW = "p"
 LATE_S = 5e-3  # deviation of a step that 95% of the steps must keep within
 
 
@@ -33,7 +32,7 @@ LATE_S = 5e-3  # deviation of a step that 95% of the steps must keep within
 class Session:
     """What is needed to record demonstrations of a task; all devices are connected.
 
-    ``writer`` is of the folder; ``preview(observation)`` writes a page with the keypoints found in a start image;
+    ``writer`` is of the folder; ``show(observation)`` shows a start image and the keypoints found in it;
     ``next_scene()`` prepares an emulated scene and returns its seed, None where a person arranges it.
     """
 
@@ -42,7 +41,7 @@ class Session:
     camera: Camera
     writer: DatasetWriter
     operator: Operator
-    preview: Callable[[Observation], object]
+    show: Callable[[Observation], object]
     next_scene: Callable[[], int] | None = None
 
     def record(self, count: int) -> None:
@@ -79,12 +78,9 @@ class Session:
         if operator.ask(arrange, ENTER + QUIT) != ENTER:
             return None
         start = observe(self.station.config, self.camera)
-        while True:
-            hold = "hold the leader near its follower's pose; Enter couples both, p shows keypoints, q ends"
-            key = operator.ask(hold, ENTER + PREVIEW + QUIT)
-            if key != PREVIEW:
-                return start if key == ENTER else None
-            self.preview(start)
+        self.show(start)
+        hold = "hold the leader near its follower's pose; Enter couples both, q ends"
+        return start if operator.ask(hold, ENTER + QUIT) == ENTER else None
 
     def _store(self, episode: Episode, journal: Journal, seed: int | None) -> None:
         """Add the episode if the person wants it, and say at once what `rip check` finds."""

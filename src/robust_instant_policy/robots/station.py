@@ -144,10 +144,10 @@ class Station:
         stopped, holds = "", True
         try:
             self._loop(command, self.gate.admit, log)
-            stopped = stop.reason
         except (RobotError, UnreachableError) as error:
             stopped, holds = str(error), isinstance(error, StoppedError | UnreachableError)
-        return Played(log.path(self.rate_hz, self.arms), stopped, holds)
+        path = log.path(self.rate_hz, self.arms)
+        return Played(path, stopped or stop.reason, holds)  # a request may have come after the last command
 
     def lead(self, command: Callable[[Sequence[ArmState]], Sequence[Command] | None]) -> None:
         """Let the arms follow ``command(states)``, slowed down by `Gate.limited`, until it returns None."""

@@ -107,12 +107,12 @@ def _add_http(app: FastAPI, planner: Planner, debug: bool) -> None:
     with_key = [Security(APIKeyHeader(name="Authorization", auto_error=False, description="Api-Key KEY"))]
 
     def state(job: Job) -> dict[str, Any]:
-        told: dict[str, Any] = {name: getattr(job, name) for name in ("id", "robot", "state", "stage", "done", "total")}
-        if job.state == "done":
+        told: dict[str, Any] = {"id": job.id, "robot": job.robot, "state": job.state}
+        if told["state"] == "done":
             return told | as_json(reply(planner, job))
-        if job.state in ("refused", "failed"):
+        if told["state"] in ("refused", "failed"):
             return told | {"error": _tell(job.future.exception(), debug)}  # type: ignore[arg-type]
-        return told
+        return told | {"stage": job.stage, "done": job.done, "total": job.total}
 
     def find(plan_id: str) -> Job:
         job = planner.find(plan_id)

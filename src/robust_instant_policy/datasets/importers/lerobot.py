@@ -1,14 +1,13 @@
 """LeRobot v3 datasets whose frames carry end-effector poses, or joint positions and a URDF.
 
 The format does not store the camera's intrinsics and pose or the meaning of gripper values, so the user supplies them.
-Where the names of a vector's columns say what they are, see `layouts`.
+Which features hold poses and grippers, see `lerobot_poses`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,39 +20,13 @@ from robust_instant_policy.datasets.folder import Folder, open_folder
 from robust_instant_policy.datasets.images import decode_image
 from robust_instant_policy.datasets.importers.depth import PIXEL_FORMAT, dequantised, is_depth, unit_of
 from robust_instant_policy.datasets.importers.hdf5 import choose_camera
-from robust_instant_policy.datasets.importers.joints import JointModel
-from robust_instant_policy.datasets.importers.layouts import (
-    ARMS,
-    NO_POSE,
-    POSITION,
-    ROTATIONS,
-    Columns,
-    arm_of,
-    axis_names,
-    gripper_columns,
-    is_gripper,
-    pose_columns,
-    poses_of,
-    unnamed_columns,
-    words_of,
-)
+from robust_instant_policy.datasets.importers.lerobot_poses import grippers_in, poses_in
 from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode
 from robust_instant_policy.datasets.importers.timing import even_steps, held, resampled, seconds_of
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt
 from robust_instant_policy.geometry import FloatArray, as_numbers
 
-UNNAMED_POSES = {"cartesian_position": "rpy", "ee_pose": None, "eef_pose": None, "tcp_pose": None}  # and their rotation
-# A position and its rotation in two features: the word before, and the last words of their names, with the rotation
-# that so many numbers are ("" is a quaternion in an unknown order).
-GRIPPERS = ("ee", "eef", "effector", "tcp", "gripper", "tool", "hand")
-POSITION_ENDINGS = ("pos", "position", "xyz", "translation")
-ROTATION_ENDINGS: dict[tuple[str, ...], dict[int, str]] = {
-    **{(word,): {4: ""} for word in ("quat", "quaternion", "rot", "rotation", "ori", "orientation")},
-    **{(word,): {3: "rpy"} for word in ("rpy", "euler")},
-    **{words: {3: "rotvec", 4: "axis_angle"} for words in (("axis", "angle"), ("axisangle",))},
-    ("rotvec",): {3: "rotvec"},
-}
 ADVICE = (
     "A LeRobot dataset names the axes of a pose ee.x, ee.y, ee.z and a rotation (ee.wx …, rx …, roll …, qx … qw), or "
     "the rig says where it is (pose_key, rotation) or how to compute it (joints: urdf, link), and which feature holds "
@@ -75,7 +48,7 @@ def read_lerobot(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
     camera = choose_camera(path, cameras, rig.camera)
     depth_key = rig.depth_key or _depth_stream(features, camera)
     for episode in range(len(folder.episodes)):
-        poses, gripper = _poses(folder, episode, rig), _gripper(folder, episode, rig)
+        poses, gripper = poses_in(folder, episode, rig), grippers_in(folder, episode, rig)
         rgb = None if camera is None else _first_image(folder, episode, camera)
         depth = None if depth_key is None else _first_depth(folder, episode, depth_key, rig.depth_unit_m)
         name = f"{path} (episode {episode})"
@@ -116,136 +89,6 @@ def _seconds(folder: Folder, episode: int, name: str) -> FloatArray | None:
         if step > 0.5 * np.ptp(stamps) / (len(stamps) - 1):  # as for times of day: too coarse for frames
             return None
     return seconds_of(name, stamps, folder.rate_hz)
-
-
-def _vectors(folder: Folder) -> list[str]:
-    """Features that may hold a pose or a gripper: measured ones first, then commanded ones."""
-    keys = [key for key, feature in folder.info["features"].items() if feature["dtype"].startswith(("float", "int"))]
-    groups = (layout.STATE_KEY, "observation.", layout.ACTION_KEY)
-    return [key for group in groups for key in keys if next((g for g in groups if key.startswith(g)), "") == group]
-
-
-def _poses(folder: Folder, episode: int, rig: Rig) -> FloatArray | None:
-    """Poses ``(T, A, 4, 4)``; None where no feature is known to hold them."""
-    where, name = [rig.pose_key] if rig.pose_key else _vectors(folder), f"{folder.root} (episode {episode})"
-    if rig.joints is not None:
-        models = {"": rig.joints} if isinstance(rig.joints, JointModel) else dict(zip(ARMS, rig.joints, strict=True))
-        for key in where:
-            names = axis_names(folder.info["features"][key])
-            if names:
-                values = _matrix(folder, episode, key, names)
-                return np.stack([model.poses(names, values, arm) for arm, model in models.items()], axis=1)
-    arms: dict[str, FloatArray] = {}
-    for key in where:
-        names = axis_names(folder.info["features"][key])
-        for columns in pose_columns(names, rig.rotation) or _unnamed(folder, key, names, rig):
-            arm = columns.arm or arm_of(key)
-            if arm not in arms and (arm or not arms):  # an arm that has no name is the only one
-                values = _matrix(folder, episode, key, names)
-                arms[arm] = poses_of(name, values, columns, rig.position_unit_m, rig.rotation_unit_rad, rig.tool)
-        pair = _rotation_for(folder, key, rig)
-        if pair is not None and arm_of(key) not in arms and (arm_of(key) or not arms):
-            other, order, columns = pair
-            values = np.concatenate([folder.matrix(episode, key)[:, order], folder.matrix(episode, other)], axis=1)
-            of_both = f"{name}, {key} with {other}"
-            arms[arm_of(key)] = poses_of(of_both, values, columns, rig.position_unit_m, rig.rotation_unit_rad, rig.tool)
-        if {"left", "right"} <= arms.keys() or "" in arms:
-            break
-    for key in where:
-        if arms and "" not in arms and arm_of(key) not in arms and _is_gripper_position(folder, key):
-            raise DatasetError(f"{name}: {key} has no rotation of the same name beside it, such as …_quat")
-    chosen = [arms[arm] for arm in ARMS if arm in arms] or list(arms.values())
-    return np.stack(chosen, axis=1) if chosen else None
-
-
-def _rotation_for(folder: Folder, key: str, rig: Rig) -> tuple[str, list[int], Columns] | None:
-    """The feature with the rotation where ``key`` holds the position of a gripper, such as ``ee_quat`` for ``ee_pos``.
-
-    With it come the columns of x, y, z in ``key``, and where x, y, z and then the columns of the other feature are.
-    None where there is no such pair, or names or widths that are not understood.
-    """
-    features = folder.info["features"]
-    words, order = _words(key), _order(axis_names(features[key]))
-    if not _is_gripper_position(folder, key) or order is None:
-        return None
-    for other, (ending, kinds) in product(_vectors(folder), ROTATION_ENDINGS.items()):
-        if _words(other) != [*words[:-1], *ending] or arm_of(other) != arm_of(key):
-            continue
-        width, names = _width(features[other]), [name.lower() for name in axis_names(features[other])]
-        kind = rig.rotation or kinds.get(width)
-        if kind is None or (kind and ROTATIONS[kind] != width):
-            continue
-        if sorted(names) == ["w", "x", "y", "z"]:
-            names = [f"q{name}" for name in names]
-        found = pose_columns([*POSITION, *names], kind or None)
-        if not found and names in ([], list(POSITION)):
-            columns = unnamed_columns(len(POSITION) + width, kind or None)
-            found = [] if columns is None else [columns]
-        if found:
-            return other, order, found[0]
-    return None
-
-
-def _is_gripper_position(folder: Folder, key: str) -> bool:
-    words = _words(key)
-    named = len(words) > 1 and words[-1] in POSITION_ENDINGS and words[-2] in GRIPPERS and not NO_POSE & set(words)
-    return named and _width(folder.info["features"][key]) == len(POSITION)
-
-
-def _words(key: str) -> list[str]:
-    return [word for word in words_of(key) if word not in ARMS]
-
-
-def _width(feature: Mapping[str, Any]) -> int:
-    return int(np.prod(feature["shape"]))
-
-
-def _order(names: list[str]) -> list[int] | None:
-    """The columns of x, y and z; in this order where there are no names, None where the names are others."""
-    last = [words[-1] if (words := words_of(name)) else "" for name in names]
-    if not last:
-        return [0, 1, 2]
-    return [last.index(axis) for axis in POSITION] if sorted(last) == list(POSITION) else None
-
-
-def _unnamed(folder: Folder, key: str, names: list[str], rig: Rig) -> list[Columns]:
-    """The pose in a feature that does not name its columns."""
-    told = "_".join(word for word in words_of(key) if word not in ARMS)
-    usual = next((name for name in UNNAMED_POSES if told.endswith(name)), None)
-    if key != rig.pose_key and usual is None:
-        return []
-    size = _width(folder.info["features"][key])
-    if len({*map(str.lower, names)} & {"x", "y", "z"}) == 3:  # named, in a way that is not understood
-        return []
-    columns = unnamed_columns(size, rig.rotation or UNNAMED_POSES.get(usual or ""))
-    return [] if columns is None else [columns]
-
-
-def _gripper(folder: Folder, episode: int, rig: Rig) -> FloatArray | None:
-    """Values of the grippers ``(T, A)``; None where no feature holds them."""
-    found: dict[str, FloatArray] = {}
-    for key in _vectors(folder):
-        names, (size, *more) = axis_names(folder.info["features"][key]), folder.info["features"][key]["shape"] or [1]
-        columns = gripper_columns(names)
-        if not columns and is_gripper(key) and size == 1 and not more:
-            columns, names = {arm_of(key): 0}, []
-        for pose in () if columns else _unnamed(folder, key, names, rig):
-            if size == len(pose.position) + len(pose.turns) + 1:  # one number more than those of the pose
-                columns = {arm_of(key): size - 1}
-        for arm, column in columns.items():
-            if arm not in found:
-                found[arm] = _matrix(folder, episode, key, names)[:, column]
-        if {"left", "right"} <= found.keys() or "" in found:
-            break
-    chosen = [found[arm] for arm in ARMS if arm in found] or list(found.values())
-    return np.stack(chosen, axis=1) if chosen else None
-
-
-def _matrix(folder: Folder, episode: int, key: str, names: list[str]) -> FloatArray:
-    values = folder.matrix(episode, key)
-    if names and values.shape[1] != len(names):
-        raise DatasetError(f"{folder.root}: {key} has {values.shape[1]} numbers a frame and {len(names)} names")
-    return values
 
 
 def _images(folder: Folder, episode: int, key: str, frames: NDArray[np.intp]) -> NDArray[np.uint8]:

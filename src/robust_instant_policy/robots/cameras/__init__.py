@@ -6,7 +6,7 @@ import importlib
 from pathlib import Path
 
 from robust_instant_policy.errors import CellError
-from robust_instant_policy.robots.camera import Camera
+from robust_instant_policy.robots.camera import VideoCamera
 from robust_instant_policy.robots.cameras.lerobot import LeRobotCamera
 from robust_instant_policy.robots.cameras.realsense import RealSenseCamera
 from robust_instant_policy.robots.cameras.recorded import RecordedCamera
@@ -18,13 +18,13 @@ __all__ = ["LeRobotCamera", "RealSenseCamera", "RecordedCamera", "make_camera"]
 KINDS = ("realsense", "lerobot", "folder", "emulated")
 
 
-def make_camera(config: DeviceConfig, relative_to: Path) -> Camera:
+def make_camera(config: DeviceConfig, relative_to: Path) -> VideoCamera:
     """The camera that a cell's file describes, not connected; its paths are ``relative_to`` a folder.
 
     Raises `CellError` for an unknown kind or key. docs/calibration.md lists the keys of each kind.
     """
     section = config.section()
-    camera: Camera
+    camera: VideoCamera
     if config.kind == "realsense":
         camera = RealSenseCamera(
             section.text("serial", ""),

@@ -53,6 +53,9 @@ class LeRobotCamera:
         metres = depth.reshape(rgb.shape[:2]).astype(np.float32) * np.float32(1e-3)
         return Frame(rgb, metres, self._intrinsics, time.monotonic())
 
+    def preview(self) -> NDArray[np.uint8]:
+        return self._answer(self._device.read)
+
     def disconnect(self) -> None:
         self._answer(self._device.disconnect)
 

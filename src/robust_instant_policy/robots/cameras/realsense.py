@@ -34,7 +34,7 @@ class RealSenseCamera:
     """A D415, D405, D435 or D455; see `robots.camera.Camera`.
 
     ``serial`` empty takes the only one connected. ``burst`` frames are combined into one depth image by the temporal
-    filter; 1 for live pictures. A ``device`` of the SDK may be given instead of a serial number. `read` waits for a new
+    filter. A ``device`` of the SDK may be given instead of a serial number. `read` waits for a new
     pair of frames for ``timeout_s``.
     """
 
@@ -105,6 +105,10 @@ class RealSenseCamera:
         lens = self._intrinsics
         intrinsics = np.array([[lens.fx, 0, lens.ppx], [0, lens.fy, lens.ppy], [0, 0, 1.0]])
         return Frame(rgb, metres.astype(np.float32), intrinsics, color.get_timestamp() / 1e3)
+
+    def preview(self) -> NDArray[np.uint8]:
+        self._drain()
+        return np.array(self._pair().get_color_frame().get_data())
 
     def disconnect(self) -> None:
         for sensor in self._sensors:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import RobotError
 from robust_instant_policy.robots.camera import Frame
@@ -30,6 +33,10 @@ class RecordedCamera:
         seen = Observation.load(self._files[self._next])
         self._next += 1
         return Frame(seen.rgb, seen.depth, seen.intrinsics, self._next * INTERVAL_S)
+
+    def preview(self) -> NDArray[np.uint8]:
+        """The image that is read last, or first: looking uses up none."""
+        return Observation.load(self._files[max(self._next - 1, 0)]).rgb
 
     def disconnect(self) -> None:
         self._files = []

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import RobotError
@@ -135,6 +136,9 @@ class EmulatedCamera:
             seen = Observation.load(file)
         self._frames += 1
         return Frame(seen.rgb, seen.depth, seen.intrinsics, float(self._frames))
+
+    def preview(self) -> NDArray[np.uint8]:
+        return self.read().rgb
 
     def disconnect(self) -> None:
         """Nothing to close."""

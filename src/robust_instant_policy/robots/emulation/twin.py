@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -33,7 +33,10 @@ class Twin(Protocol):
 
     def advance(self, commands: Sequence[Command]) -> None: ...
     def states(self) -> Sequence[TwinState]: ...
-    def photograph(self) -> Observation: ...
+
+    def photograph(self) -> Callable[[], Observation]:
+        """The scene now, for a camera that takes its time: what is returned may be called while the twin advances."""
+        ...
 
     def reset(self, seed: int) -> None:
         """Build the scene with a ``seed``; the arms are at home."""
@@ -66,7 +69,7 @@ class LaggingTwin:
     def states(self) -> Sequence[TwinState]:
         return self._states
 
-    def photograph(self) -> Observation:
+    def photograph(self) -> Callable[[], Observation]:
         raise RobotError("this emulated cell has no scene and no camera; name a task in its table [emulation]")
 
     def failure(self) -> str:
@@ -110,7 +113,8 @@ class SharedTwin:
 
     def photograph(self) -> Observation:
         with self._lock:
-            return self.twin.photograph()
+            picture = self.twin.photograph()
+        return picture()
 
     def failure(self) -> str:
         with self._lock:

@@ -1,0 +1,220 @@
+"""The camera of a cell in a process of its own, which also shows its live picture in the browser.
+
+recording process ── read, start image, lines ──▶ camera process ──▶ browser, http://127.0.0.1:…
+                  ◀──── frames, errors ─────────  camera, keypoints
+
+So neither pictures nor keypoints take time of the process that commands the arms.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import multiprocessing
+import os
+import re
+import select
+import signal
+import threading
+import time
+from collections.abc import Mapping
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+from PIL import Image
+
+from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.errors import DatasetError, RipError, RobotError
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.network import is_loopback
+from robust_instant_policy.perception import KeypointExtractor
+from robust_instant_policy.reporting.pages import render
+from robust_instant_policy.reporting.pictures import Picture, keypoint_marks, picture
+from robust_instant_policy.robots.camera import Frame, VideoCamera
+from robust_instant_policy.robots.cameras import make_camera
+from robust_instant_policy.robots.cell import DeviceConfig
+
+LIVE_S = 0.2  # between two live pictures
+MOST_SHARE = 0.2  # of the camera's time for them
+JPEG_QUALITY = 80
+NICE = 5  # the process that commands the arms goes first
+STARTING_S, READING_S = 60.0, 40.0
+
+
+class LiveCamera:
+    """See `robots.camera.Camera`; ``url`` is the page's address once the camera is connected.
+
+    ``folder`` is that of the cell's file; the page marks the keypoints of the dataset ``demos`` that lie in
+    ``workspace (2, 3)``.
+    """
+
+    def __init__(self, config: DeviceConfig, folder: Path, demos: Path, workspace: FloatArray):
+        self.name, self.url = config.kind, ""
+        context = multiprocessing.get_context("spawn")
+        self._wire, self._theirs = context.Pipe()
+        device = (config.kind, dict(config.options), config.where)
+        self._process = context.Process(
+            target=_serve, args=(self._theirs, device, folder, demos, workspace), daemon=True, name="camera"
+        )
+
+    def connect(self) -> None:
+        self._process.start()
+        self._theirs.close()  # so that the end of the process ends the pipe
+        self.name, self.url = self._answer(STARTING_S)
+
+    def read(self) -> Frame:
+        with contextlib.suppress(OSError):  # the answer tells that the process has ended
+            self._wire.send(("read", None))
+        frame: Frame = self._answer(READING_S)
+        return frame
+
+    def show(self, start: Observation) -> None:
+        """Mark the keypoints of the demonstrations in the ``start`` image, once they are found."""
+        self._tell("start", start)
+
+    def say(self, line: str) -> None:
+        """Show what the person was told last. Never waits."""
+        self._tell("line", line)
+
+    def disconnect(self) -> None:
+        self._wire.close()  # it ends then
+        self._process.join(5.0)
+        self._process.kill()
+
+    def _tell(self, what: str, value: object) -> None:
+        """The page is no reason to stop an arm, or to wait."""
+        with contextlib.suppress(OSError):
+            if select.select([], [self._wire], [], 0)[1]:
+                self._wire.send((what, value))
+
+    def _answer(self, seconds: float) -> Any:
+        try:
+            if not self._wire.poll(seconds):
+                raise RobotError(f"camera {self.name} did not answer within {seconds:g} s; connect it again")
+            answer = self._wire.recv()
+        except (EOFError, OSError):
+            raise RobotError(f"the process of camera {self.name} has ended; run the same command again") from None
+        if isinstance(answer, str):
+            raise RobotError(answer)
+        return answer
+
+
+def _serve(
+    wire: Connection, device: tuple[str, Mapping[str, Any], str], folder: Path, demos: Path, workspace: FloatArray
+) -> None:
+    """Read the camera and show it until ``wire`` is closed. What is no number or frame on it is an error's words."""
+    for number in (signal.SIGINT, signal.SIGHUP):  # the recording process stops the arms first
+        signal.signal(number, signal.SIG_IGN)
+    os.nice(NICE)
+    page = _Page(demos, workspace)
+    try:
+        camera = make_camera(DeviceConfig(*device), folder)
+        camera.connect()
+    except RipError as error:
+        wire.send(str(error))
+        return
+    server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(page))
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    wire.send((camera.name, f"http://127.0.0.1:{server.server_address[1]}"))
+    with contextlib.suppress(EOFError, OSError):
+        _work(wire, camera, page)
+    camera.disconnect()
+
+
+def _work(wire: Connection, camera: VideoCamera, page: _Page) -> None:
+    due = time.monotonic()
+    while True:
+        if wire.poll(max(due - time.monotonic(), 0.0)):
+            what, value = wire.recv()
+            if what == "read":
+                try:
+                    wire.send(camera.read())
+                except RipError as error:
+                    wire.send(str(error))
+            elif what == "line":
+                page.line = value
+            else:
+                page.start = picture(value.rgb, "start image")
+                threading.Thread(target=page.find_keypoints, args=(value,), daemon=True).start()
+            continue
+        began = time.monotonic()
+        try:
+            page.live = _jpeg(camera.preview())
+            page.error = ""
+        except RipError as error:
+            page.error = str(error)
+        now = time.monotonic()
+        due = now + max(LIVE_S, (now - began) / MOST_SHARE)
+
+
+class _Page:
+    """What the browser shows: replaced by the camera's thread, read by those of the server."""
+
+    def __init__(self, demos: Path, workspace: FloatArray):
+        self._demos, self._workspace = demos, workspace
+        self.live, self.line, self.error = b"", "", ""
+        self.start: Picture | None = None
+
+    def find_keypoints(self, seen: Observation) -> None:
+        """Mark the keypoints of the demonstrations so far in a start image, or say why there are none."""
+        try:
+            recorded = load_demonstrations(self._demos)
+        except DatasetError:
+            self.start = picture(seen.rgb, "start image; its keypoints are shown once there is a demonstration")
+            return
+        try:
+            extractor = KeypointExtractor(workspace=self._workspace)
+            extractor.fit([one.observation for one in recorded], [one.trajectory for one in recorded])
+            located = extractor.locate(seen)
+        except RipError as error:  # too few demonstrations so far, too little in common, or a missing package
+            self.start = picture(seen.rgb, f"start image; no keypoints yet: {error}")
+            return
+        low, high = located.confidence.min(), located.confidence.max()
+        words = f"start image with the keypoints of the demonstrations so far ({len(recorded)}), confidence"
+        caption = "; ".join((f"{words} {low:.2f} to {high:.2f}", *located.notes))
+        self.start = picture(seen.rgb, caption, marks=keypoint_marks(located.pixels, located.confidence))
+
+
+def _handler(page: _Page) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            path, start = self.path.partition("?")[0], page.start
+            if not is_loopback(re.sub(r":\d+$", "", self.headers.get("Host", ""))):
+                self._send(403, "text/plain", b"this address is for this machine only")  # a name that resolves to it
+            elif path == "/":
+                self._send(200, "text/html", render("record.html", title="Recording").encode())
+            elif path == "/live.jpg":
+                self._send(200 if page.live else 404, "image/jpeg", page.live)
+            elif path == "/state":
+                state = {"line": page.line, "error": page.error, "start": id(start)}
+                self._send(200, "application/json", json.dumps(state).encode())
+            elif path == "/start":
+                self._send(200, "text/html", b"" if start is None else render("start.html", start=start).encode())
+            else:
+                self._send(404, "text/plain", b"not here")
+
+        def _send(self, status: int, kind: str, content: bytes) -> None:
+            self.send_response(status)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(content)))
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            with contextlib.suppress(OSError):  # the browser went away
+                self.wfile.write(content)
+
+        def log_message(self, format: str, *arguments: object) -> None:
+            """The terminal is the operator's."""
+
+    return Handler
+
+
+def _jpeg(rgb: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).save(buffer, format="jpeg", quality=JPEG_QUALITY)
+    return buffer.getvalue()

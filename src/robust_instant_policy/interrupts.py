@@ -1,0 +1,41 @@
+"""Ctrl-C that is not lost.
+
+Python prints and drops a `KeyboardInterrupt` that is raised inside a destructor, a callback of a weak reference
+(imports have many) or a callback of a C library. So each Ctrl-C is noted, too, and raised again by `raise_pending`.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+_pending = threading.Event()
+
+
+@contextmanager
+def noted_interrupts() -> Iterator[None]:
+    """Note each Ctrl-C while the context lasts. Does nothing where Ctrl-C does not raise `KeyboardInterrupt`."""
+    _pending.clear()
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield  # a background job, or a program with a handler of its own
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        _pending.set()
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def raise_pending() -> None:
+    """Raise `KeyboardInterrupt` if there was a Ctrl-C that nobody caught."""
+    if _pending.is_set():
+        raise KeyboardInterrupt
