@@ -138,9 +138,7 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
     single = _squared(things, scene, hands)
     if demos < 2 * LEAST_OF_A_WAY or single.max() < UNEXPLAINED_M**2:
         return None
-    single = np.minimum(single, _least(_errors(things, scene, hands, more_origins=True)[1]))
-    if single.max() < UNEXPLAINED_M**2:
-        return None
+    one_way = _cost(np.minimum(single, _least(_errors(things, scene, hands, more_origins=True)[1])))
     arm, step = np.unravel_index(int(single.argmax()), single.shape)
     splits: dict[bytes, list[tuple[Split, np.ndarray, float]]] = {}
     for measure, threshold, gap in _cuts(things, scene):
@@ -166,7 +164,7 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
             cost = _cost(squared) - min(margins[widest], 1.0)
             if best is None or cost < best[0]:
                 best = cost, same[widest][0], same[widest][1]
-    return (best[1], best[2]) if best is not None and best[0] + SPLIT_GAIN < _cost(single) else None
+    return (best[1], best[2]) if best is not None and best[0] + SPLIT_GAIN < one_way else None
 
 
 def _squared(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> FloatArray:
