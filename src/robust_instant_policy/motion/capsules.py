@@ -111,6 +111,21 @@ class ArmShape:
         ends = transform_points(self._base, ends)
         return Capsules(ends[:, :, 0], ends[:, :, 1], self.radius)
 
+    def height(self, links: Capsules) -> FloatArray:
+        """Height ``(N,)`` above the table of the lowest of ``links`` that moves, metres.
+
+        A hand works at the table, where its fingertips are checked: of its other parts the axes count.
+        """
+        height: FloatArray = (links.lowest() + np.where(self.hand, links.radius, 0.0))[:, self.near_table].min(axis=1)
+        return height
+
+    def distance(self, links: Capsules, other: ArmShape, others: Capsules) -> FloatArray:
+        """Distance ``(N,)`` of ``links`` from the links ``others`` of an arm with the shape ``other``, metres."""
+        apart = links.distances(others)
+        apart[:, self.fixed[:, None] & other.fixed] = np.inf  # nothing moves there
+        nearest: FloatArray = apart.min(axis=(1, 2))
+        return nearest
+
     def link_distances(self, joints: FloatArray, capsules: Capsules, near: float = 0.0) -> FloatArray:
         """Distances ``(N, P)`` of `pairs` at ``joints (N, J)``, where the ``capsules`` are: those of the capsules, and
         where these are nearer than ``near``, metres, those of the shapes themselves, of meshes as convex hulls."""

@@ -142,16 +142,12 @@ class Space:
             what = "a fingertip goes"
             _refuse(depth - limits.table_depth, depth, limits.table_depth, arm, what, "m below the table",
                     "table_depth", rate_hz)  # fmt: skip
-            # A hand works at the table, where its fingertips were checked; of its other parts the axes stay above it.
-            height = links.lowest() + np.where(shape.hand, links.radius, 0.0)
-            least = height[:, shape.near_table].min(axis=1)
+            least = shape.height(links)
             _refuse(-least, least, 0.0, arm, "a link has a height above the table of", "m", "model", rate_hz)
             begun = joints[:1, index] if start is None else start[index : index + 1]
             self._check_links(index, joints[:, index], links, self._links(index, begun), rate_hz)
         for one, other in combinations(range(len(self._arms)), 2):
-            apart = capsules[one].distances(capsules[other])
-            apart[:, self._shapes[one].fixed[:, None] & self._shapes[other].fixed] = np.inf  # nothing moves there
-            apart = apart.min(axis=(1, 2))
+            apart = self._shapes[one].distance(capsules[one], self._shapes[other], capsules[other])
             what = f"its distance from {self._arms[other].name} is"
             _refuse(limits.arm_distance - apart, apart, limits.arm_distance, self._arms[one], what, "m",
                     "arm_distance", rate_hz)  # fmt: skip

@@ -27,7 +27,7 @@ from robust_instant_policy.perception.objects import (
 )
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
 from robust_instant_policy.perception.relevance import MIN_RELEVANCE, relevances, shares, still
-from robust_instant_policy.perception.selection import select_points
+from robust_instant_policy.perception.selection import best_buddies, select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
 from robust_instant_policy.perception.view import Hands, View, make_view
 from robust_instant_policy.trajectory import Trajectory
@@ -129,8 +129,11 @@ class KeypointExtractor:
                 f"{len(self.objects_)} objects were found for {self.num_keypoints} keypoints; {left} of them have none"
             )
         self._places = []  # of each object's keypoints, in the first image
+        buddies = best_buddies(views)
         for thing, count in zip(self.objects_, counts, strict=True):
-            points, replaced = select_points(thing, views, count, self.seed) if count else (np.zeros((0, 3)), [])
+            points, replaced = (
+                select_points(thing, views, buddies, count, self.seed) if count else (np.zeros((0, 3)), [])
+            )
             self._places.append(points)
             notes += replaced
         found = [self._locate(view, [t.registrations[i] for t in self.objects_]) for i, view in enumerate(views)]
@@ -179,7 +182,7 @@ class KeypointExtractor:
         expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
         points, pixels, measured = lift_to_surface(view.observation, view.depth, expected)
         counts = [len(places) for places in self._places]
-        confidence = np.repeat([found.score for found in registrations], counts)
+        confidence = np.repeat([found.fitness * found.similarity for found in registrations], counts)
         confidence *= np.concatenate(
             [certainty(t.model, found, view, places) for t, places, found in triples if len(places)]
         )

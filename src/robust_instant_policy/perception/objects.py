@@ -30,7 +30,7 @@ SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of
 MIN_TARGET_POINTS = round(MIN_OBJECT_M2 / TARGET_M**2)
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
-RIVAL_SCALE = 0.01  # of the score by which a motion is worse, for a weight of 1/e
+RIVAL_SCALE = 0.03  # of the score by which a motion is worse, for a weight of 1/e
 SAME_PLACE_M = 0.02
 MIN_FITNESS = 0.15  # of an object's registration in every demonstration
 MIN_PART_FITNESS = 0.5  # median, of a part: things of one kind in other colours have 0.3, in the same 0.7
@@ -46,17 +46,22 @@ MAX_SHARED_BY_PART = 0.6  # which touches its object
 MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one
 
 
+NO_MOTIONS = np.zeros((0, 4, 4))
+
+
 @dataclass(frozen=True, eq=False)
 class Registration:
     """An object in an image: ``pose (4, 4)`` from the reference image's world to the image's, after the change of size
     ``shape (4, 4)`` (`fit_shape`), together ``motion (4, 4)``; ``fitness`` of its
-    points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones.
+    points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones;
+    ``rivals (R, 4, 4)``: other poses that ICP came to.
     """
 
     pose: FloatArray
     fitness: float
     similarity: float
     template: int
+    rivals: FloatArray = field(default_factory=lambda: NO_MOTIONS)
     shape: FloatArray = field(default_factory=lambda: np.eye(4))
 
     @property
@@ -68,7 +73,6 @@ class Registration:
         return (self.fitness + self.similarity) / 2
 
 
-NO_MOTIONS = np.zeros((0, 4, 4))
 IN_REFERENCE = Registration(np.eye(4), 1.0, 1.0, 0)
 
 
@@ -214,7 +218,7 @@ def _shapes(models: Sequence[Model], found: Sequence[Registration], view: View) 
 def _owners(models: Sequence[Model], motions: Sequence[FloatArray], points: FloatArray) -> IntArray:
     """Number ``(N,)`` of the nearest object, at its motion, to each of ``points (N, 3)``; -1 where none is near."""
     moved = [transform_points(motion, model.points) for model, motion in zip(models, motions, strict=True)]
-    distances = np.array([cKDTree(one).query(points)[0] for one in moved])
+    distances = np.array([cKDTree(one).query(points, distance_upper_bound=SHAPE_REACH_M)[0] for one in moved])
     return np.where(distances.min(axis=0) < SHAPE_REACH_M, distances.argmin(axis=0), -1)
 
 
@@ -260,6 +264,8 @@ def _split(
             was_hidden = home.hides(transform_points(invert_pose(rest.pose), view.target[:, :3]))
             taken = np.concatenate([_explained([rest_model], [rest], [0]), view.target[was_hidden, :3]])
             pairs.append((rest, register(part_model.templates, view, taken, parent=rest.pose)))
+            if pairs[-1][1].fitness < MIN_FITNESS:
+                break
         fitness = [own.fitness for _, own in pairs]
         if min(fitness) < MIN_FITNESS or np.median(fitness) < MIN_PART_FITNESS:
             continue
@@ -381,10 +387,10 @@ def _another_template(
     to_reference = np.asarray(np.linalg.inv(found.motion), dtype=np.float64)
     known = templates[found.template].xyzrgb
     points = transform_points(to_reference, view.target[:, :3])
-    distance = cKDTree(known[:, :3]).query(points)[0]
+    distance = cKDTree(known[:, :3]).query(points, distance_upper_bound=SAME_OBJECT_M)[0]
     same = distance < SAME_OBJECT_M
     if len(others):
-        same &= distance <= cKDTree(others).query(view.target[:, :3])[0]
+        same[same] = distance[same] <= cKDTree(others).query(view.target[same, :3])[0]
     if not same.any():
         return []
     seen = np.concatenate([points, view.target[:, 3:]], axis=1)[same].astype(np.float32)
@@ -450,7 +456,7 @@ def register(
     source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
     refined = refine(candidates, source, target, similarity, view.hides)
     pose = settle_turn(refined.motions[0], source, target, similarity, view.hides)
-    return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index)
+    return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index, refined.motions[1:])
 
 
 def certainty(model: Model, found: Registration, view: View, points: FloatArray) -> FloatArray:
@@ -458,7 +464,8 @@ def certainty(model: Model, found: Registration, view: View, points: FloatArray)
     of the reference image where ``found`` does.
     """
     similarity = _similarity(model.templates, view, _similarities(model.templates, view))
-    rivals = find_rivals(found.pose, model.templates[found.template].xyzrgb, view.target, similarity, view.hides)
+    motions = np.concatenate([found.pose[None], found.rivals])
+    rivals = find_rivals(motions, model.templates[found.template].xyzrgb, view.target, similarity, view.hides)
     weights = np.exp(np.minimum(rivals.score - rivals.score[0], 0) / RIVAL_SCALE)
     places = points @ np.swapaxes(rivals.motions[:, :3, :3], 1, 2) + rivals.motions[:, None, :3, 3]
     same = np.linalg.norm(places - places[0], axis=2) < SAME_PLACE_M

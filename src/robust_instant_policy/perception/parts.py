@@ -27,12 +27,12 @@ BoolArray = NDArray[np.bool_]
 def candidate_parts(
     home: View, piece: IntArray, views: Sequence[View], motions: Sequence[FloatArray]
 ) -> list[BoolArray]:
-    """Parts ``(N,)`` of a ``piece (N,)`` of the image ``home`` that may move against the rest: those that are thin, and
-    those that the ``motions`` of the whole into each of ``views`` leave off the surfaces there.
+    """Parts ``(N,)`` of a ``piece (N,)`` of the image ``home`` that may move against the rest: those that the
+    ``motions`` of the whole into each of ``views`` leave off the surfaces there, and those of these that are thin.
     """
-    off = _distances(home.points[piece], views, motions) > UNEXPLAINED_M
-    parts = [*_connected(home, piece, _thin(home, piece)), *_connected(home, piece, off)[:1]]
-    return [part for part in parts if part.sum() <= len(piece) / 2]
+    distances = _distances(home.points[piece], views, motions)
+    parts = [*_connected(home, piece, _thin(home, piece)), *_connected(home, piece, distances > UNEXPLAINED_M)[:1]]
+    return [part for part in parts if part.sum() <= len(piece) / 2 and distances[part].mean() > MIN_DISTANCE_M]
 
 
 def _thin(home: View, piece: IntArray) -> BoolArray:
@@ -60,11 +60,10 @@ def gain(
     points: FloatArray, views: Sequence[View], whole: Sequence[FloatArray], own: Sequence[FloatArray]
 ) -> tuple[float, float]:
     """By how much the distances of a part's ``points (N, 3)`` from the surfaces in ``views`` become smaller with its
-    ``own`` motions than with those of the ``whole``: as a share, 0 where those explain it, and in all, metres.
+    ``own`` motions than with those of the ``whole``: as a share, and in all, metres.
     """
     before, after = (_distances(points, views, motions) for motions in (whole, own))
-    share = 0.0 if before.mean() < MIN_DISTANCE_M else 1 - float(after.mean() / before.mean())
-    return share, float((before - after).sum())
+    return 1 - float(after.mean() / before.mean()), float((before - after).sum())
 
 
 def _distances(points: FloatArray, views: Sequence[View], poses: Sequence[FloatArray]) -> FloatArray:
@@ -81,8 +80,11 @@ def _distances(points: FloatArray, views: Sequence[View], poses: Sequence[FloatA
         height, width = view.depth.shape
         seen = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
         distances[row, ~seen | view.hides(moved)] = np.nan
-    known = np.isfinite(distances).any(axis=0)
-    typical = np.zeros(len(points))
-    typical[known] = np.nanpercentile(distances[:, known], PERCENTILE, axis=0)
+    # As np.nanpercentile, which is slow: those that are not known come last.
+    last = np.isfinite(distances).sum(axis=0) - 1
+    place = np.maximum(last, 0) * PERCENTILE / 100
+    ordered = np.sort(distances, axis=0)
+    below, above = (ordered[number.astype(np.intp), np.arange(len(points))] for number in (place, np.ceil(place)))
+    typical = np.where(last < 0, 0, below + (above - below) * (place % 1))
     near = cKDTree(points).query(points, min(SMOOTHING_POINTS, len(points)))[1]
     return typical[near].mean(axis=1)

@@ -41,6 +41,7 @@ OWN_REACH_M = 0.04  # image points further from the object belong to others
 RESTART_ANGLES = np.deg2rad([0.0, -25.0, 25.0])
 COARSE_POINTS = 60
 FINALISTS = 3
+MAX_BEHIND = 0.06  # of a finalist's score
 SAME_SHIFT_M, SAME_TURN_RAD = 0.005, np.deg2rad(5.0)  # between motions that ICP brings to one
 COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)  # kernel width in each iteration
 FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
@@ -74,7 +75,7 @@ def vote_for_motions(source: FloatArray, target: FloatArray, similarities: Float
     the largest ``similarities (N, M)``.
     """
     count = min(MATCHES_PER_POINT, len(target))
-    best = np.argpartition(-similarities, count - 1, axis=1)[:, :count]
+    best = np.argpartition(similarities, -count, axis=1)[:, -count:]
     # Rotations about the object's centre need the smallest range of shifts.
     centre = source.mean(axis=0)
     similarity = np.take_along_axis(similarities, best, axis=1).reshape(-1)
@@ -129,10 +130,11 @@ def refine(
     centre = source[:, :3].mean(axis=0)
     starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
     starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M, hidden)
-    leading = _distinct(starts, centre, np.argsort(-fitness - similarity(starts), kind="stable"))[:FINALISTS]
+    score = (fitness + similarity(starts)) / 2
+    order = np.argsort(-score, kind="stable")
+    leading = _distinct(starts, centre, order[score[order] > score.max() - MAX_BEHIND])[:FINALISTS]
     refined = [
-        icp(start, source, _near(start, source, _around(start, source, target)), FINE_REACH_M, hidden)
-        for start in starts[leading][:, None]
+        icp(start[None], source, _near(start, source, target), FINE_REACH_M, hidden) for start in starts[leading]
     ]
     finalists, fitness = (np.concatenate(parts) for parts in zip(*refined, strict=True))
     similarities = similarity(finalists)
@@ -156,17 +158,18 @@ def settle_turn(
 
 
 def find_rivals(
-    motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
 ) -> Candidates:
-    """``motion (4, 4)`` itself, and that turned by `LARGE_TURNS` or slid by `SLIDES_M`, measured with a subset."""
-    centre = source[:, :3].mean(axis=0)
-    turned = rotated(motion, centre, LARGE_TURNS)
-    slid = np.repeat(motion[None], len(SLIDES_M), axis=0)
+    """``motions (C, 4, 4)``, the best first, and that one turned by `LARGE_TURNS` or slid by `SLIDES_M`, all measured
+    with a subset of the points.
+    """
+    turned = rotated(motions[0], source[:, :3].mean(axis=0), LARGE_TURNS)
+    slid = np.repeat(motions[:1], len(SLIDES_M), axis=0)
     slid[:, :3, 3] += SLIDES_M
-    coarse = _coarse(source, _around(motion[None], source, target))
+    coarse = _coarse(source, _around(motions, source, target))
     turned = icp(turned, *coarse, RIVAL_REACH_M, hidden)[0]
-    motions = np.concatenate([motion[None], turned, slid])
-    return Candidates(motions, icp(motions, *coarse, (), hidden)[1], similarity(motions))
+    every = np.concatenate([motions, turned, slid])
+    return Candidates(every, icp(every, *coarse, (), hidden)[1], similarity(every))
 
 
 def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
@@ -219,10 +222,10 @@ def _distinct(motions: FloatArray, centre: FloatArray, order: IntArray) -> list[
     return kept
 
 
-def _near(motions: FloatArray, source: Float32Array, target: Float32Array) -> Float32Array:
-    """Those of ``target (M, 6)`` that ``source (N, 6)`` may reach at ``motions (C, 4, 4)``; at least one."""
-    places = source[:: max(1, len(source) // COARSE_POINTS), :3] @ np.swapaxes(motions[:, :3, :3], 1, 2)
-    near = within(target[:, :3], (places + motions[:, None, :3, 3]).reshape(-1, 3), max(COARSE_REACH_M))
+def _near(motion: FloatArray, source: Float32Array, target: Float32Array) -> Float32Array:
+    """Those of ``target (M, 6)`` in the box that ``source (N, 6)`` may reach at ``motion (4, 4)``; at least one."""
+    places, reach = transform_points(motion, source[:, :3]), max(COARSE_REACH_M)
+    near = ((target[:, :3] > places.min(axis=0) - reach) & (target[:, :3] < places.max(axis=0) + reach)).all(axis=1)
     return target[near] if near.any() else target[:1]
 
 
@@ -230,7 +233,8 @@ def within(points: ArrayLike, others: FloatArray, distance: float) -> NDArray[np
     """Which of ``points (N, 3)`` are nearer than ``distance`` to one of ``others (M, 3)``."""
     points = np.asarray(points, dtype=np.float64)
     near = ((points > others.min(axis=0) - distance) & (points < others.max(axis=0) + distance)).all(axis=1)
-    near[near] = cKDTree(others).query(points[near], distance_upper_bound=distance)[0] < distance
+    tree = cKDTree(others, balanced_tree=False, compact_nodes=False)  # quicker to build, and used once
+    near[near] = tree.query(points[near], distance_upper_bound=distance)[0] < distance
     return near
 
 

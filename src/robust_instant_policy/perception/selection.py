@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
 from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
+from robust_instant_policy.perception.descriptors import IntArray
 from robust_instant_policy.perception.objects import RigidObject
 from robust_instant_policy.perception.view import View
 
@@ -17,9 +19,12 @@ SEEN_M = 0.008  # from the surface: greatest distance of a point that is seen in
 MATCH_REACH_PATCHES = 2.0  # greatest distance of a mutual nearest neighbour from its place
 CENTRE_WEIGHT = 0.5  # of the distance to the cluster's centre, against a point's score
 KMEANS_ROUNDS = 20
+Buddies = tuple[IntArray, NDArray[np.bool_]]
 
 
-def select_points(thing: RigidObject, views: Sequence[View], count: int, seed: int) -> tuple[FloatArray, list[str]]:
+def select_points(
+    thing: RigidObject, views: Sequence[View], buddies: Sequence[Buddies], count: int, seed: int
+) -> tuple[FloatArray, list[str]]:
     """``count`` points ``(count, 3)`` of an object, metres, in the first view, and a note for each replaced one.
 
     The object's points are clustered. Each cluster gives the point with the best sum of three shares (images in which
@@ -35,7 +40,7 @@ def select_points(thing: RigidObject, views: Sequence[View], count: int, seed: i
         expected = transform_points(registration.motion, points)
         seen += cKDTree(view.points).query(expected)[0] < SEEN_M
         has_depth &= lift_to_surface(view.observation, view.depth, expected)[2]
-    score = seen / len(views) + _mutual_matches(thing, views, points)
+    score = seen / len(views) + _mutual_matches(thing, views, buddies, points)
     score += home.descriptors.saliency.flat[home.descriptors.cells_at(pixels)]
 
     clusters = min(count, len(points))
@@ -60,22 +65,39 @@ def select_points(thing: RigidObject, views: Sequence[View], count: int, seed: i
     return points[chosen], notes
 
 
-def _mutual_matches(thing: RigidObject, views: Sequence[View], points: FloatArray) -> FloatArray:
-    """Share ``(N,)`` of the other views in which the descriptors at ``points (N, 3)`` have a mutual nearest neighbour
-    near their place ("best buddies", Amir et al. 2022).
+def best_buddies(views: Sequence[View]) -> list[Buddies]:
+    """For each but the first of ``views``: which of its foreground cells is the most similar to each one of the first
+    view, ``(C,)``, and whether that is mutual, up to the distance of `MATCH_REACH_PATCHES` ("best buddies", Amir et al.
+    2022), ``(C,)``.
+    """
+    home = views[0]
+    cells, places = home.cells[: len(home.cell_points)], home.cell_points
+    found = []
+    for view in views[1:]:
+        similar = home.descriptors.similarities(cells, view.descriptors, view.cells[: len(view.cell_points)])
+        match = similar.argmax(axis=1)
+        back = similar.argmax(axis=0)[match]
+        found.append((match, np.linalg.norm(places[back] - places, axis=1) < _reach(home)))
+    return found
+
+
+def _reach(home: View) -> float:
+    """Metres."""
+    patch_m = home.descriptors.step.mean() * np.nanmedian(home.depth) / home.observation.intrinsics[0, 0]
+    return float(MATCH_REACH_PATCHES * patch_m)
+
+
+def _mutual_matches(
+    thing: RigidObject, views: Sequence[View], buddies: Sequence[Buddies], points: FloatArray
+) -> FloatArray:
+    """Share ``(N,)`` of the other views in which the descriptors at ``points (N, 3)`` have a best buddy near their
+    place.
     """
     if len(views) == 1:
         return np.ones(len(points))
     home = views[0]
-    cells = home.cells[: len(home.cell_points)]
-    patch_m = home.descriptors.step.mean() * np.nanmedian(home.depth) / home.observation.intrinsics[0, 0]
-    reach = MATCH_REACH_PATCHES * patch_m
-    votes = np.zeros(len(cells))
-    for view, registration in zip(views[1:], thing.registrations[1:], strict=True):
-        similar = home.descriptors.similarities(cells, view.descriptors, view.cells[: len(view.cell_points)])
-        match = similar.argmax(axis=1)
-        back = similar.argmax(axis=0)[match]
-        mutual = np.linalg.norm(home.cell_points[back] - home.cell_points, axis=1) < reach
+    votes = np.zeros(len(home.cell_points))
+    for view, registration, (match, mutual) in zip(views[1:], thing.registrations[1:], buddies, strict=True):
         expected = transform_points(registration.motion, home.cell_points)
-        votes += mutual & (np.linalg.norm(view.cell_points[match] - expected, axis=1) < reach)
+        votes += mutual & (np.linalg.norm(view.cell_points[match] - expected, axis=1) < _reach(home))
     return votes[cKDTree(home.cell_points).query(points)[1]] / (len(views) - 1)

@@ -15,6 +15,7 @@ MIN_HEIGHT_M = 0.010  # above the table, for points of objects,
 MIN_HEIGHT_DEVIATIONS = 4.0  # or this many standard deviations of the depth noise, if that is more
 BELOW_M = 0.05  # a ray that ends this far under the plane has passed the table
 MIN_BELOW_SHARE = 0.01  # of the image's points: fewer are errors of the depth
+SQUARE_M = 0.005  # of the plane, that is on or beside the table as a whole
 EDGE_MARGIN_M = 0.02  # by which an object may reach over the edge
 
 
@@ -61,10 +62,12 @@ class Table:
         if not len(self.off) or not len(self.on):
             return np.zeros(len(points), dtype=bool)
         places = (points @ levelling(self.plane)[:3, :3].T)[:, :2]
+        squares, of = np.unique(np.rint(places / SQUARE_M) @ (1, 1j), return_inverse=True)
+        centres = np.stack([squares.real, squares.imag], axis=1) * SQUARE_M
         to_table, to_nothing = (
-            cKDTree(tested[:: max(1, len(tested) // 4000)]).query(places)[0] for tested in (self.on, self.off)
+            cKDTree(tested[:: max(1, len(tested) // 4000)]).query(centres)[0] for tested in (self.on, self.off)
         )
-        return to_table > to_nothing + EDGE_MARGIN_M
+        return (to_table > to_nothing + EDGE_MARGIN_M)[of]
 
 
 def levelling(plane: FloatArray) -> FloatArray:

@@ -241,7 +241,14 @@ def subsample(indices: IntArray, count: int, seed: int) -> IntArray:
 
 def spread_out(points: ArrayLike) -> IntArray:
     """Numbers of one of ``points (N, 3)``, metres, in each cube with edges of `TARGET_M`."""
-    return np.unique(np.floor(np.asarray(points) / TARGET_M).astype(int), axis=0, return_index=True)[1]
+    return np.unique(_cubes(np.asarray(points), TARGET_M), return_index=True)[1]
+
+
+def _cubes(points: FloatArray, edge: float) -> IntArray:
+    """Number ``(N,)`` of the cube with this ``edge``, metres, in which each of ``points (N, 3)`` lies."""
+    number = np.floor(points / edge).astype(np.intp)
+    number -= number.min(axis=0)
+    return np.ravel_multi_index(tuple(number.T), tuple(number.max(axis=0) + 1))
 
 
 def _cell_points(cells: IntArray, label: IntArray, points: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -289,10 +296,7 @@ def connected_pieces(points: FloatArray, gap: float) -> IntArray:
     """Number ``(N,)`` of the piece of each of ``points (N, 3)``: chains of points less than ``gap`` apart."""
     if not len(points):
         return np.zeros(0, dtype=np.intp)
-    _, voxel, counts = np.unique(
-        np.floor(points / (gap / 3)).astype(int), axis=0, return_inverse=True, return_counts=True
-    )
-    voxel = voxel.reshape(-1)
+    _, voxel, counts = np.unique(_cubes(points, gap / 3), return_inverse=True, return_counts=True)
     centres = np.stack([np.bincount(voxel, axis) for axis in points.T], axis=1) / counts[:, None]
     a, b = cKDTree(centres).query_pairs(gap, output_type="ndarray").T
     graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(len(centres), len(centres)))
