@@ -153,5 +153,10 @@ if ! command -v chromium chromium-browser google-chrome >/dev/null; then
   fi
 fi
 
+# The test of the SpaceMouse runs the system's HIDAPI on an emulated device; without them it is skipped.
+if ! command -v umockdev-run >/dev/null; then
+  apt_install libhidapi-hidraw0 umockdev || say "umockdev could not be installed; the test of the SpaceMouse will be skipped"
+fi
+
 fingerprint >"$STAMP"
 say "done; the command is .venv/bin/rip"

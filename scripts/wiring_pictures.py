@@ -21,7 +21,7 @@ class Box:
 
 PICTURES: dict[str, tuple[int, int, dict[str, Box], tuple[tuple[str, str, str], ...]]] = {
     "wiring-aloha": (
-        760, 290,
+        900, 290,
         {
             "pc": Box(440, 50, ("computer",)),
             "u2d2": Box(270, 140, ("U2D2 adapter", "/dev/serial/by-id/…")),
@@ -30,10 +30,12 @@ PICTURES: dict[str, tuple[int, int, dict[str, Box], tuple[tuple[str, str, str], 
             "follower": Box(270, 250, ("ViperX 300", "servos 1 to 9")),
             "leader": Box(620, 250, ("WidowX 250 leader", "servos 1 to 9")),
             "power": Box(85, 250, ("12 V supply",)),
+            "power2": Box(805, 250, ("12 V supply",)),
         },
         (
             ("pc", "u2d2", "USB"), ("pc", "u2d2b", "USB"), ("pc", "camera", "USB 3"),
             ("u2d2", "follower", "TTL bus, 1 Mbit/s"), ("u2d2b", "leader", "TTL bus"), ("power", "follower", "12 V"),
+            ("power2", "leader", "12 V"),
         ),
     ),
     "wiring-ur5e": (
@@ -42,9 +44,9 @@ PICTURES: dict[str, tuple[int, int, dict[str, Box], tuple[tuple[str, str, str], 
             "pc": Box(380, 50, ("computer",)),
             "switch": Box(130, 140, ("Ethernet cable", "or switch")),
             "camera": Box(560, 140, ("RealSense D415", "above the table")),
-            "box": Box(130, 250, ("UR control box", "RTDE 30004")),
+            "box": Box(130, 250, ("UR control box", "ports 30004, 63352")),
             "arm": Box(380, 250, ("UR5e",)),
-            "gripper": Box(630, 250, ("Hand-E", "port 63352")),
+            "gripper": Box(630, 250, ("Hand-E", "with its URCap")),
         },
         (
             ("pc", "switch", "Ethernet"), ("pc", "camera", "USB 3"), ("switch", "box", "192.168.1.x"),
@@ -55,8 +57,8 @@ PICTURES: dict[str, tuple[int, int, dict[str, Box], tuple[tuple[str, str, str], 
         760, 290,
         {
             "pc": Box(380, 50, ("computer",)),
-            "board": Box(200, 140, ("bus adapter", "of the follower")),
-            "board2": Box(560, 140, ("bus adapter", "of the leader")),
+            "board": Box(200, 140, ("bus adapter and", "supply, follower")),
+            "board2": Box(560, 140, ("bus adapter and", "supply, leader")),
             "camera": Box(380, 140, ("RealSense D405", "above the table")),
             "follower": Box(200, 250, ("SO-101 follower", "servos 1 to 6")),
             "leader": Box(560, 250, ("SO-101 leader", "servos 1 to 6")),

@@ -144,6 +144,13 @@ def test_lost_answers_are_noted(context, scene):
     assert "4 of 5 answers were usable in time" in plan.notes
 
 
+def test_it_is_told_where_the_model_was_not_asked(demonstrations):
+    llm = Imitator()
+    plan = RobustInstantPolicy(llm, SETTINGS).fit([demonstrations[0]] * 3).plan(demonstrations[1].observation)
+    assert not llm.asked
+    assert any("the language model was not asked" in note for note in plan.notes)
+
+
 def test_answers_that_cannot_be_read_are_quoted_and_silence_is_called_silence(context, scene):
     with pytest.raises(PlanningError, match=r"I am sorry.*model"):
         RobustInstantPolicy(Imitator(says="I am sorry"), SETTINGS).fit_context(context).plan_scene(scene)

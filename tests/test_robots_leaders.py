@@ -1,7 +1,13 @@
-"""Leaders: servo arms on an emulated bus, LeRobot's shape, keyboard and gamepad; their guided calibration."""
+"""Leaders: servo arms on an emulated bus, LeRobot's shape, keyboard, gamepad, SpaceMouse; their guided calibration."""
 
+import json
 import os
+import shutil
+import struct
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -202,6 +208,50 @@ def test_a_gamepad_moves_the_tool_and_its_button_the_gripper(cell, tmp_path):
         leader.read(follower())
 
 
+# Reports of a SpaceMouse Compact: an axis pushed fully is 350; 1 is translation, 2 rotation, 3 the buttons.
+FORWARD, LEFT_TURN = struct.pack("<Bhhh", 1, 0, -350, 0), struct.pack("<Bhhh", 2, 0, 0, -175)
+PRESSED, RELEASED = b"\x03\x01" + bytes(5), b"\x03" + bytes(6)
+STEPS = """
+import os, termios, tty
+terminal = os.open("/dev/hidraw0", os.O_RDWR | os.O_NOCTTY)  # umockdev's device; it would take report 3 for Ctrl-C
+tty.setraw(terminal, termios.TCSANOW)
+import json, time
+from robust_instant_policy.robots.leaders.spacemouse import SpaceMouseSource
+source, steps = SpaceMouseSource("", 50), []
+source.connect()
+while len(steps) < 50:
+    motion, toggled = source.step()
+    steps.append((motion.tolist(), bool(toggled)))
+    time.sleep(0.02)
+print(json.dumps(steps))
+"""
+
+
+@pytest.mark.skipif(not shutil.which("umockdev-run"), reason="umockdev emulates the kernel's side of the device")
+def test_a_spacemouse_moves_the_tool_as_its_cap_is_pushed_and_a_button_the_gripper(tmp_path):
+    """Through pyspacemouse and the system's HIDAPI; only /sys and /dev/hidraw0 are emulated."""
+    descriptor = bytes.fromhex("05010908A101C0")
+    size = struct.pack("<i", len(descriptor))
+    answers = {"HIDIOCGRDESCSIZE": size, "HIDIOCGRDESC": size + descriptor.ljust(4096, b"\0")}
+    lines = [f"{name} 0 {content.hex().upper()}" for name, content in answers.items()]
+    (tmp_path / "ioctl").write_text("\n".join(["@DEV /dev/hidraw0", *lines, ""]))
+    reports = (FORWARD, LEFT_TURN, PRESSED, RELEASED, PRESSED, RELEASED, PRESSED)
+    script = b"".join(b"r 200 " + b"".join(map(escaped, report)) + b"\n" for report in reports)
+    (tmp_path / "reports").write_bytes(script)
+    command = ["umockdev-run", "-d", str(Path(__file__).with_name("files") / "spacemouse.umockdev")]
+    command += ["-i", f"/dev/hidraw0={tmp_path / 'ioctl'}", "-s", f"/dev/hidraw0={tmp_path / 'reports'}"]
+    done = subprocess.run([*command, "--", sys.executable, "-c", STEPS], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    steps = json.loads(done.stdout.splitlines()[-1])
+    np.testing.assert_allclose(steps[-1][0], [0.12 / 50, 0, 0, 0, 0, 0.4 / 50], atol=1e-9)
+    assert sum(toggled for _, toggled in steps) % 2 == 1  # three presses, however they fall into steps
+
+
+def escaped(byte):
+    """A byte of a report in umockdev's script."""
+    return b"^" + bytes([byte + 64]) if byte < 32 else b"^`" if byte == ord("^") else bytes([byte])
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -228,3 +278,5 @@ def test_a_leader_that_is_missing_or_not_calibrated_is_told(cell):
         leader_of(cell, kind="spacenav")
     with pytest.raises(RobotError, match=r"cannot open /dev/input/js99.*group input"):
         leader_of(cell, kind="gamepad", device="/dev/input/js99").connect()
+    with pytest.raises(RobotError, match=r"SpaceMouse cannot be opened: .*libhidapi-hidraw0 and a udev rule"):
+        leader_of(cell, kind="spacemouse").connect()

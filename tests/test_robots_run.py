@@ -5,13 +5,15 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from robust_instant_policy import Plan
 from robust_instant_policy.cli import main
 from robust_instant_policy.reporting.run import RunRecord
 from robust_instant_policy.robots.cell import CELLS
-from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.robots.path import MeasuredPath, Sweep
+from tests.robots_cells import arms_of
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no release for Python 3.13")
 
@@ -38,6 +40,13 @@ def test_a_plan_is_made_refused_where_it_does_not_belong_and_executed_where_it_d
     folder = workbench / "runs/cell"
     assert RunRecord.load(folder).outcome == "planned, not executed"
     assert not (folder / "measured.npz").exists()
+    assert "the whole motion, from the park pose" in (folder / "report.html").read_text()
+    sweep = Sweep.load(folder / "sweep.npz")
+    (arm,), _ = arms_of(cell)
+    np.testing.assert_allclose(sweep.tools[0, 0], arm.home_pose[:3, 3], atol=1e-3)
+    path = Plan.load(folder / "plan.json").trajectory.triplets[:, 0, 1:].mean(axis=1)
+    away = np.linalg.norm(path[:, None] - sweep.tools[:, 0], axis=-1).min(axis=1)
+    assert away.max() < 0.01  # what is shown passes each waypoint of the plan
 
     assert run(cell, "--plan", str(folder)) == 2  # nobody is there to be asked
     assert "use --yes" in capsys.readouterr().err

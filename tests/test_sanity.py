@@ -60,6 +60,15 @@ def test_sound_demonstrations_and_a_sound_scene_pass(report, scene):
     assert report.reference.scene_spread_m > 0.02
 
 
+def test_a_person_who_takes_more_or_less_time_for_the_same_way_is_no_error(demonstrations):
+    by_hand = []
+    for index, shown in enumerate(demonstrations):
+        times = np.linspace(0, 1, len(shown.trajectory))
+        steps = np.round(times ** (0.5, 1, 2)[index % 3] * (len(times) - 1)).astype(int)
+        by_hand.append(replace(shown, trajectory=Trajectory(shown.trajectory.actions[steps], times)))
+    assert check_demonstrations(by_hand).findings == ()
+
+
 def test_the_noise_of_a_depth_camera_is_no_error(demonstrations, scene):
     noise = CameraNoise()
     noisy = [replace(d, observation=noise.photograph(d.observation, i)) for i, d in enumerate(demonstrations)]

@@ -274,6 +274,7 @@ def test_http_gives_the_same_plan_and_documents_itself(running, scene):
     assert job.status_code == 201
     answer = running.http("GET", f"/plans/{job.json()['id']}?wait=30").json()
     assert answer["state"] == "done"
+    assert "stage" not in answer
     expected = running.policy.plan(scene)  # depth came in steps of 0.1 mm
     np.testing.assert_allclose(answer["actions"], expected.trajectory.actions, atol=2e-3)
     assert answer["server_timing"]["infer_ms"] > 0

@@ -107,7 +107,7 @@ class LiveCamera:
 def _serve(
     wire: Connection, device: tuple[str, Mapping[str, Any], str], folder: Path, demos: Path, workspace: FloatArray
 ) -> None:
-    """Read the camera and show it until ``wire`` is closed. What is no number or frame on it is an error's words."""
+    """Read the camera and show it until ``wire`` is closed; a text sent over it is an error's message."""
     for number in (signal.SIGINT, signal.SIGHUP):  # the recording process stops the arms first
         signal.signal(number, signal.SIG_IGN)
     os.nice(NICE)
@@ -140,7 +140,7 @@ def _work(wire: Connection, camera: VideoCamera, page: _Page) -> None:
             elif what == "line":
                 page.line = value
             else:
-                page.start = picture(value.rgb, "start image")
+                page.show(picture(value.rgb, "start image"))
                 threading.Thread(target=page.find_keypoints, args=(value,), daemon=True).start()
             continue
         began = time.monotonic()
@@ -160,25 +160,30 @@ class _Page:
         self._demos, self._workspace = demos, workspace
         self.live, self.line, self.error = b"", "", ""
         self.start: Picture | None = None
+        self.shown = 0  # start images so far, by which the browser knows a new one
+
+    def show(self, start: Picture) -> None:
+        self.start = start
+        self.shown += 1
 
     def find_keypoints(self, seen: Observation) -> None:
         """Mark the keypoints of the demonstrations so far in a start image, or say why there are none."""
         try:
             recorded = load_demonstrations(self._demos)
         except DatasetError:
-            self.start = picture(seen.rgb, "start image; its keypoints are shown once there is a demonstration")
+            self.show(picture(seen.rgb, "start image; its keypoints are shown once there is a demonstration"))
             return
         try:
             extractor = KeypointExtractor(workspace=self._workspace)
             extractor.fit([one.observation for one in recorded], [one.trajectory for one in recorded])
             located = extractor.locate(seen)
         except RipError as error:  # too few demonstrations so far, too little in common, or a missing package
-            self.start = picture(seen.rgb, f"start image; no keypoints yet: {error}")
+            self.show(picture(seen.rgb, f"start image; no keypoints yet: {error}"))
             return
         low, high = located.confidence.min(), located.confidence.max()
         words = f"start image with the keypoints of the demonstrations so far ({len(recorded)}), confidence"
         caption = "; ".join((f"{words} {low:.2f} to {high:.2f}", *located.notes))
-        self.start = picture(seen.rgb, caption, marks=keypoint_marks(located.pixels, located.confidence))
+        self.show(picture(seen.rgb, caption, marks=keypoint_marks(located.pixels, located.confidence)))
 
 
 def _handler(page: _Page) -> type[BaseHTTPRequestHandler]:
@@ -192,7 +197,7 @@ def _handler(page: _Page) -> type[BaseHTTPRequestHandler]:
             elif path == "/live.jpg":
                 self._send(200 if page.live else 404, "image/jpeg", page.live)
             elif path == "/state":
-                state = {"line": page.line, "error": page.error, "start": id(start)}
+                state = {"line": page.line, "error": page.error, "start": page.shown}
                 self._send(200, "application/json", json.dumps(state).encode())
             elif path == "/start":
                 self._send(200, "text/html", b"" if start is None else render("start.html", start=start).encode())

@@ -25,6 +25,7 @@ from robust_instant_policy.reporting.run import (
     MEASURED_FILE,
     PLAN_FILE,
     SEEN_FILE,
+    SWEEP_FILE,
     RunRecord,
     save_context,
     write_report,
@@ -40,6 +41,7 @@ from robust_instant_policy.robots.execution import (
     park,
     require_trust,
 )
+from robust_instant_policy.robots.path import Sweep
 from robust_instant_policy.robots.signals import stop_on_signals
 from robust_instant_policy.robots.station import HOLDING, Played, Station
 
@@ -183,14 +185,15 @@ class _Run:
             raise StoppedError(f"{stop.reason}; {HOLDING}")
 
     def _prepare(self, station: Station) -> tuple[Motion, RunRecord]:
-        """A checked motion, and what is known of the run; the page shows the plan already."""
+        """A checked motion, and what is known of the run; the page shows both."""
         if self._planner is None:
             record = RunRecord.load(self._out)
         else:
             record = self._planner.plan(self._observation(), self._out)
         record = replace(record, success=None, outcome=PLANNED)
         record.save(self._out)
-        (self._out / MEASURED_FILE).unlink(missing_ok=True)  # of an earlier run
+        for name in (SWEEP_FILE, MEASURED_FILE):  # of an earlier run
+            (self._out / name).unlink(missing_ok=True)
         plan = Plan.load(self._out / PLAN_FILE)
         page = write_report(self._out)
         self._screen.say(f"the plan, with a confidence of {plan.confidence or 0.0:.2f}: {page}")
@@ -204,6 +207,9 @@ class _Run:
                 self._config.rate_hz,
                 self._speed,
             )
+            Sweep.of(motion, station.arms, self._config.rate_hz).save(self._out / SWEEP_FILE)
+            write_report(self._out)
+        self._screen.say(f"what the arms will sweep is on the page now: {page}")
         return motion, record
 
     def _observation(self) -> Observation:

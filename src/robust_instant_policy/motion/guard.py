@@ -122,7 +122,7 @@ class Space:
     def __init__(self, arms: Sequence[Arm], limits: Limits):
         self._arms, self._limits = arms, limits
         self._shapes = [ArmShape(arm.kinematics) for arm in arms]
-        self._parked = [shape.at(arm.home) for shape, arm in zip(self._shapes, arms, strict=True)]
+        self._parked = [self._links(index, arm.home[None]) for index, arm in enumerate(arms)]
 
     def check(self, joints: FloatArray, rate_hz: float, to_home: bool = False, start: FloatArray | None = None) -> None:
         """Refuse ``joints (N, A, J)`` with a tool outside the workspace, a link at the table, or two arms or two links
@@ -142,32 +142,34 @@ class Space:
             what = "a fingertip goes"
             _refuse(depth - limits.table_depth, depth, limits.table_depth, arm, what, "m below the table",
                     "table_depth", rate_hz)  # fmt: skip
-            # A hand works at the table, where its fingertips were checked; of its other parts the axes stay above it.
-            height = links.lowest() + np.where(shape.hand, links.radius, 0.0)
-            least = height[:, shape.near_table].min(axis=1)
+            least = shape.height(links)
             _refuse(-least, least, 0.0, arm, "a link has a height above the table of", "m", "model", rate_hz)
-            begun = joints[0, index] if start is None else start[index]
-            self._check_links(index, links, shape.at(begun), rate_hz)
+            begun = joints[:1, index] if start is None else start[index : index + 1]
+            self._check_links(index, joints[:, index], links, self._links(index, begun), rate_hz)
         for one, other in combinations(range(len(self._arms)), 2):
-            apart = capsules[one].distances(capsules[other])
-            apart[:, self._shapes[one].fixed[:, None] & self._shapes[other].fixed] = np.inf  # nothing moves there
-            apart = apart.min(axis=(1, 2))
+            apart = self._shapes[one].distance(capsules[one], self._shapes[other], capsules[other])
             what = f"its distance from {self._arms[other].name} is"
             _refuse(limits.arm_distance - apart, apart, limits.arm_distance, self._arms[one], what, "m",
                     "arm_distance", rate_hz)  # fmt: skip
 
-    def _check_links(self, index: int, links: Capsules, start: Capsules, rate_hz: float) -> None:
-        """Refuse ``links (N, C)`` of an arm that meet, unless they did so at home or at the ``start``."""
+    def _links(self, index: int, joints: FloatArray, capsules: Capsules | None = None) -> FloatArray:
+        """Distances ``(N, P)`` of an arm's own links at ``joints (N, J)``."""
+        shape = self._shapes[index]
+        return shape.link_distances(joints, capsules or shape.at(joints), self._limits.link_distance)
+
+    def _check_links(
+        self, index: int, joints: FloatArray, capsules: Capsules, begun: FloatArray, rate_hz: float
+    ) -> None:
+        """Refuse ``joints (N, J)`` of an arm whose links meet, unless they did so at home or in ``begun (1, P)``."""
         shape, limit = self._shapes[index], self._limits.link_distance
         if not shape.pairs.size:
             return
-        apart = links.between(*shape.pairs)
-        least = np.minimum(self._parked[index].between(*shape.pairs), start.between(*shape.pairs)).min(axis=0)
-        pair = int(np.argmin((apart - least.clip(max=limit)).min(axis=0)))
-        one, other = (shape.links[capsule] for capsule in shape.pairs[:, pair])
+        apart = self._links(index, joints, capsules)
+        least = np.minimum(self._parked[index], begun)[0].clip(max=limit)
+        pair = int(np.argmin((apart - least).min(axis=0)))
+        one, other = (shape.links[shape_index] for shape_index in shape.pairs[:, pair])
         what = f"the distance between its links {one} and {other} is"
-        values = apart[:, pair]
-        _refuse(least[pair].clip(max=limit) - values, values, limit, self._arms[index], what, "m", "link_distance",
+        _refuse(least[pair] - apart[:, pair], apart[:, pair], limit, self._arms[index], what, "m", "link_distance",
                 rate_hz)  # fmt: skip
 
     def outside(self, joints: FloatArray) -> FloatArray:

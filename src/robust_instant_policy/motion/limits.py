@@ -14,7 +14,7 @@ from robust_instant_policy.motion.checks import TABLE_TOLERANCE_M
 TURN_PER_STEP_RAD = np.deg2rad(60)
 STEP_M = 0.35
 ARM_DISTANCE_M = 0.02
-LINK_DISTANCE_M = 0.005
+LINK_DISTANCE_M = 0.0  # capsules that enclose links exceed them already
 FOLLOWING_ERROR_RAD = 0.35
 
 

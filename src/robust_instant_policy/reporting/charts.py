@@ -13,7 +13,7 @@ from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.policies.policy import Plan
 from robust_instant_policy.reporting.pictures import keypoint_colour, scene_points, tool_points
-from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.robots.path import MeasuredPath, Sweep
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
 MM = 1000.0
@@ -85,6 +85,28 @@ def paths_in_space(plan: Plan, observation: Observation) -> go.Figure:
         text=[str(k) for k in range(len(keypoints))],
         marker={"size": 5, "color": [keypoint_colour(k) for k in range(len(keypoints))]},
     )
+    return _in_space(figure)
+
+
+def swept_space(sweep: Sweep, observation: Observation) -> go.Figure:
+    """The path between the fingertips from where the arms are parked, and the arms' links along it, pale at first and
+    dark at the end, over the points that the camera saw."""
+    figure = go.Figure()
+    points, colours = scene_points(observation, MAX_POINTS)
+    look = {"size": 2, "color": [f"rgb({r},{g},{b})" for r, g, b in colours]}
+    _add_points(figure, points.astype(np.float32), mode="markers", name="camera", marker=look, hoverinfo="skip")
+    gap = np.full((*sweep.links.shape[:2], 1, 3), np.nan)  # between the lines of two links
+    lines = np.concatenate([sweep.links, gap], axis=2).reshape(-1, 3)
+    seconds = np.repeat(sweep.seconds, 3 * sweep.links.shape[1])
+    shade = {
+        "color": seconds,
+        "colorscale": WEIGHT_COLOURS,
+        "colorbar": {"title": "seconds", "thickness": 14, "len": 0.6},
+    }
+    _add_points(figure, lines, mode="lines", name="links of the arms", line={**shade, "width": 6}, hoverinfo="skip")
+    for arm in range(sweep.tools.shape[1]):
+        look = {"line": {"color": ROBUST_COLOUR, "width": 6}, "showlegend": arm == 0, "legendgroup": "tool"}
+        _add_points(figure, sweep.tools[:, arm], mode="lines", name="between the fingertips", **look)
     return _in_space(figure)
 
 

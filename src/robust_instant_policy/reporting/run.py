@@ -27,6 +27,7 @@ from robust_instant_policy.reporting.charts import (
     dimensions_over_time,
     executed_paths,
     paths_in_space,
+    swept_space,
     weights_over_time,
 )
 from robust_instant_policy.reporting.pages import data_uri, render
@@ -40,19 +41,20 @@ from robust_instant_policy.reporting.pictures import (
     tool_points,
 )
 from robust_instant_policy.reporting.tables import NONE, Table
-from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.robots.path import MeasuredPath, Sweep
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 SHOWN_DEMONSTRATIONS = 10
 FRAME_AXIS_M = 0.04  # length of the axes of a frame in the picture
 MOSTLY = 0.5  # mean weight below which a hallucinated candidate was ignored more than followed
-RUN_FILE, PLAN_FILE, SEEN_FILE, CONTEXT_FILE, VIDEO_FILE, MEASURED_FILE, REPORT_FILE = (
+RUN_FILE, PLAN_FILE, SEEN_FILE, CONTEXT_FILE, VIDEO_FILE, SWEEP_FILE, MEASURED_FILE, REPORT_FILE = (
     "run.json",
     "plan.json",
     "observation.npz",
     "context.npz",
     "execution.mp4",
-    "measured.npz",  # of a run on real arms
+    "sweep.npz",  # of a run on real arms
+    "measured.npz",
     "report.html",
 )
 
@@ -110,6 +112,7 @@ def write_report(folder: str | Path) -> Path:
     shown = _load_context(folder / CONTEXT_FILE)
     video = folder / VIDEO_FILE
     measured = MeasuredPath.load(folder / MEASURED_FILE) if (folder / MEASURED_FILE).exists() else None
+    sweep = Sweep.load(folder / SWEEP_FILE) if (folder / SWEEP_FILE).exists() else None
     page = render(
         "run.html",
         title=f"{record.task}: {record.outcome}",
@@ -129,6 +132,7 @@ def write_report(folder: str | Path) -> Path:
         candidates=_candidate_table(plan),
         weights=chart(weights_over_time(plan)) if plan.candidates else "",
         dimensions=chart(dimensions_over_time(plan)),
+        swept="" if sweep is None else chart(swept_space(sweep, observation)),
         executed=chart(executed_paths(plan, measured)) if measured is not None else "",
         execution=_execution_table(measured) if measured is not None else None,
         confidence=_confidence_table(plan),

@@ -296,6 +296,11 @@ def _arm(section: Section, path: Path) -> ArmConfig:
     gripper = tool = None
     if "gripper" in section:
         file = path.parent / section.text("gripper")
+        if not file.exists():
+            words = (
+                "take the key out until rip calibrate tool has written it; an arm of your own needs length and opening"
+            )
+            raise section.error("gripper", f"is wrong, there is no file at {file}: {words}, metres, by a ruler first")
         gripper, tool = read_gripper(file), read_tool(file)
     config = ArmConfig(
         name=name,

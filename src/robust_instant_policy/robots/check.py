@@ -51,7 +51,7 @@ def _arms(config: CellConfig) -> list[tuple[str, bool]]:
             lines.append((_timing(arm.name, slow, config.rate_hz), slow + JITTER_S < 1 / config.rate_hz))
             lines.append((f"{arm.name}: its clock advances", len(set(clocks)) > READINGS // 2))
             lines += [(f"{arm.name}: {fault}", False) for fault in state.faults]
-            lines.append(_at_park(arm.name, state.joints - arm.home))
+            lines.append(_at_park(arm.name, state.joints, arm.home))
     return lines
 
 
@@ -61,12 +61,14 @@ def _timing(name: str, slow: float, rate_hz: float) -> str:
     )
 
 
-def _at_park(name: str, away: FloatArray) -> tuple[str, bool]:
+def _at_park(name: str, joints: FloatArray, home: FloatArray) -> tuple[str, bool]:
+    away = joints - home
     worst = int(np.argmax(np.abs(away)))
     if abs(away[worst]) < START_RAD:
         return f"{name}: at its park pose", True
     return (
-        f"{name}: joint {worst + 1} is {away[worst]:+.2f} rad away from the park pose; `rip run` moves it there first",
+        f"{name}: joint {worst + 1} is {away[worst]:+.2f} rad away from the park pose; `rip run` moves it there first "
+        f"(to park here instead: park = {joints.round(2).tolist()})",
         True,
     )
 

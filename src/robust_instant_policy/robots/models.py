@@ -87,6 +87,8 @@ def arm_of(config: ArmConfig, folder: Path = Path()) -> Arm:
     except (ValueError, KeyError, AttributeError) as error:
         words = " ".join(str(error).split())
         raise CellError(f"{model.urdf} cannot be used: {words}; it needs a link called {TOOL}") from None
+    if not compiled.ngeom:
+        raise CellError(f"{model.urdf} has no collision shapes, without which links cannot be kept apart; add them")
     count = len(config.park)
     revolute = int(np.cumprod(compiled.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).sum())
     if count == 0 or count > revolute or (config.model in KNOWN and count != revolute):

@@ -1,9 +1,10 @@
-"""What was commanded and what was measured, and what a gripper's width and force say about a grasp."""
+"""What a motion will sweep, what was commanded and measured, and what a gripper's width and force say about a grasp."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,13 +13,64 @@ import numpy as np
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import open_regular, write_whole
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.arm import Arm, Motion
+from robust_instant_policy.motion.capsules import ArmShape
 
 EMPTY_TRAVEL_M = 1.5e-3  # of each finger: less than this is left between closed fingers that hold nothing
 EMPTY_LOAD = 0.5  # share of the force limit; fingers that press on something thin use more
 CLOSING_S = 0.4  # of a closed command before the width is judged
 CLOSED_M = 1e-6
 
+SWEPT_MOMENTS = 24  # of a motion, at which its arms are drawn
+
 ARRAYS = ("rate_hz", "commanded", "measured", "commanded_tools", "measured_tools", "loads", "seconds")
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """What a motion will sweep, metres in the world: the points between the fingertips ``tools (N, A, 3)`` at each
+    step, and at some ``seconds (S,)`` the middle lines ``links (S, C, 2, 3)`` of the capsules around the arms' links.
+    """
+
+    tools: FloatArray
+    links: FloatArray
+    seconds: FloatArray
+
+    @classmethod
+    def of(cls, motion: Motion, arms: Sequence[Arm], rate_hz: float) -> Sweep:
+        rows = np.unique(np.linspace(0, len(motion.joints) - 1, SWEPT_MOMENTS).astype(int))
+        capsules = [ArmShape(arm.kinematics).at(motion.joints[rows, index]) for index, arm in enumerate(arms)]
+        links = [np.stack([links.start, links.stop], axis=2) for links in capsules]
+        return cls(tool_points(motion.joints, arms), np.concatenate(links, axis=1), rows / rate_hz)
+
+    def save(self, path: Path) -> None:
+        _save(path, {"tools": self.tools, "links": self.links, "seconds": self.seconds})
+
+    @classmethod
+    def load(cls, path: Path) -> Sweep:
+        """Raises `DatasetError` for a file that is not the sweep of a motion."""
+        return cls(**_load(path, ("tools", "links", "seconds")))
+
+
+def tool_points(joints: FloatArray, arms: Sequence[Arm]) -> FloatArray:
+    """Points between the fingertips ``(N, A, 3)``, metres in the world, at ``joints (N, A, J)``."""
+    points = [[arm.kinematics.tool_pose(row[i])[:3, 3] for i, arm in enumerate(arms)] for row in joints]
+    return np.array(points).reshape(len(joints), len(arms), 3)
+
+
+def _save(path: Path, arrays: Mapping[str, object]) -> None:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    write_whole(path, buffer.getvalue())
+
+
+def _load(path: Path, names: Sequence[str]) -> dict[str, FloatArray]:
+    """The arrays of a file that `_save` wrote. Raises `DatasetError` for another one."""
+    try:
+        with open_regular(path) as file, np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in names}
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise DatasetError(f"{path} cannot be read: {error}; execute the plan again") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,19 +88,13 @@ class MeasuredPath:
     seconds: FloatArray
 
     def save(self, path: Path) -> None:
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **{name: getattr(self, name) for name in ARRAYS})
-        write_whole(path, buffer.getvalue())
+        _save(path, {name: getattr(self, name) for name in ARRAYS})
 
     @classmethod
     def load(cls, path: Path) -> MeasuredPath:
         """Raises `DatasetError` for a file that is not a measured path."""
-        try:
-            with open_regular(path) as file, np.load(file, allow_pickle=False) as arrays:
-                values = {name: arrays[name] for name in ARRAYS}
-            return cls(float(values.pop("rate_hz")), **values)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise DatasetError(f"{path} is not a measured path: {error}") from None
+        arrays = _load(path, ARRAYS)
+        return cls(float(arrays.pop("rate_hz")), **arrays)
 
     @property
     def worst_following_error(self) -> float:

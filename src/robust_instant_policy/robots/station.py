@@ -26,7 +26,7 @@ from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.follower import Follower
 from robust_instant_policy.robots.followers import make_follower
 from robust_instant_policy.robots.models import arm_of
-from robust_instant_policy.robots.path import MeasuredPath
+from robust_instant_policy.robots.path import MeasuredPath, tool_points
 from robust_instant_policy.robots.priority import CONTROL, real_time
 from robust_instant_policy.robots.signals import StopRequest
 
@@ -224,14 +224,8 @@ class _Log:
         n = self._count
         commanded, measured = self._commanded[:n], self._measured[:n]
         seconds = self._seconds[:n] - self._seconds[0] if n else np.zeros(0)
-
-        def tools(rows: FloatArray) -> FloatArray:
-            points = [[arm.kinematics.tool_pose(row[i, :-1])[:3, 3] for i, arm in enumerate(arms)] for row in rows]
-            return np.array(points).reshape(n, len(arms), 3)
-
-        return MeasuredPath(
-            rate_hz, commanded, measured, tools(commanded), tools(np.nan_to_num(measured)), self._loads[:n], seconds
-        )
+        told, moved = (tool_points(joints[..., :-1], arms) for joints in (commanded, np.nan_to_num(measured)))
+        return MeasuredPath(rate_hz, commanded, measured, told, moved, self._loads[:n], seconds)
 
 
 def _between(motion: Motion, position: float) -> tuple[FloatArray, FloatArray]:

@@ -38,15 +38,29 @@ class Consistency:
 
 
 def gripper_poses(trajectories: Sequence[Trajectory]) -> list[FloatArray]:
-    """Tool poses ``(T, A, 4, 4)`` of every trajectory at `MOMENTS` moments, the same number T for all."""
+    """Tool poses ``(T, A, 4, 4)`` of every trajectory, the same number T for all.
+
+    They are taken at `MOMENTS` moments in time, and, since a person takes more or less time for the same way, at as
+    many distances along each gripper's path before its end.
+    """
     thinned = [downsample(trajectory, "masked", MOMENTS) for trajectory in trajectories]
     count = min(len(trajectory) for trajectory in thinned)
+    ways = [_way(trajectory) for trajectory in trajectories]
+    before_end = np.linspace(np.min([way[-1] for way in ways], axis=0), 0.0, MOMENTS)  # (MOMENTS, A)
     result = []
-    for trajectory in thinned:
-        steps = np.round(np.linspace(0, len(trajectory) - 1, count)).astype(np.intp)
-        triplets = trajectory.triplets[steps]
+    for trajectory, thin, way in zip(trajectories, thinned, ways, strict=True):
+        steps = np.round(np.linspace(0, len(thin) - 1, count)).astype(np.intp)
+        arms = range(trajectory.num_arms)
+        at = np.stack([np.searchsorted(way[:, arm], (way[-1] - before_end)[:, arm]) for arm in arms], axis=1)
+        triplets = np.concatenate([thin.triplets[steps], trajectory.triplets[at.clip(max=len(way) - 1), arms]])
         result.append(GripperTriangle.from_triplets(triplets).poses(triplets))
     return result
+
+
+def _way(trajectory: Trajectory) -> FloatArray:
+    """How far each gripper went until each step ``(T, A)``, metres."""
+    middles = trajectory.triplets[:, :, 1:].mean(axis=2)
+    return np.linalg.norm(np.diff(middles, axis=0, prepend=middles[:1]), axis=-1).cumsum(axis=0)
 
 
 def surroundings(view: View, poses: FloatArray) -> FloatArray:

@@ -32,7 +32,7 @@ class ActPanel:
         self._preview = Preview(scene)
         self._stopped = threading.Event()  # asks a comparison to end
         held = controls.held
-        gui.add_markdown("Plan first. Then let a ghost show the plan, and the arm execute it.")
+        how_to = gui.add_markdown("Plan first. Then let a ghost show the plan, and the arm execute it.")
         self._outcome = gui.add_html("")
         preview = gui.add_button("Preview", icon=viser.Icon.GHOST, color="gray")
         preview.on_click(held(lambda _: session.post(lambda: self._preview.start(plans.trajectory, session.cell))))
@@ -47,6 +47,7 @@ class ActPanel:
         compare = gui.add_button("Compare methods in this scene", icon=viser.Icon.SCALE, color="gray")
         compare.on_click(held(lambda _: session.post(self._compare)))
         self._table = gui.add_html("")
+        self.with_arms = (how_to, execute, again, self._move, compare)  # controls that need an arm
 
     def forget(self) -> None:
         """The plan no longer holds."""

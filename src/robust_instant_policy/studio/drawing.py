@@ -23,7 +23,7 @@ WIDE_M2, UP = 0.1, 0.9  # area from which faces are wide, and vertical part of a
 TUBE_SIDES = 12
 TUBE_M = (0.003, 0.06)  # least and largest radius that is drawn
 DASH = 2  # steps of a dash, and of the gap behind it
-FOLLOWED, IGNORED = np.array([0, 110, 60]), np.array([255, 244, 170])  # colours of the weights 1 and 0
+FOLLOWED, IGNORED = (0, 110, 60), (255, 244, 170)  # colours of the weights 1 and 0
 
 
 def digest(surfaces: Sequence[Surface]) -> str:
@@ -99,7 +99,8 @@ def weighed(plan: Plan, index: int, arm: int) -> tuple[FloatArray, np.ndarray]:
     """
     candidate = plan.candidates[index]
     weight = np.interp(candidate.times, plan.trajectory.times, plan.weights[index])
-    colours = (IGNORED + np.clip(weight, 0, 1)[:, None] * (FOLLOWED - IGNORED)).astype(np.uint8)
+    share = np.clip(weight, 0, 1)[:, None]
+    colours = (share * FOLLOWED + (1 - share) * IGNORED).astype(np.uint8)
     segments, steps = polyline(tool_path(candidate, arm)), np.arange(len(candidate) - 1)
     shown = np.ones(len(steps), dtype=bool)
     if plan.hallucinated[index]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,12 +11,14 @@ from scipy.spatial.transform import Rotation
 from robust_instant_policy.errors import UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
+from robust_instant_policy.motion.capsules import ArmShape
 from robust_instant_policy.motion.waypoints import plan_onward
 from robust_instant_policy.trajectory import Trajectory
 
 RESPONSE_S = 0.08  # time constant with which the gripper closes in on its target
 TURN_SPEED_RAD_S = 2.0
 ARRIVED_M, ARRIVED_RAD = 2e-4, 2e-3
+LINK_M = 0.005  # by which capsules around links may enter the table, or each other: they are larger than the links
 
 
 class Follower:
@@ -24,14 +27,14 @@ class Follower:
     def __init__(self, arms: Sequence[Arm], control_hz: float):
         self.arms, self.control_hz = arms, control_hz
         self.motion = Motion.at_home(arms)
-        self._refused: tuple[FloatArray, np.ndarray, str] | None = (
-            None  # of the last targets, no part of whose way is free
-        )
+        self._refused: tuple[FloatArray, np.ndarray, str] | None = None  # the last targets, where no way is free
+        self._shapes = [ArmShape(arm.kinematics) for arm in arms]
+        self._room = self._room_after(self.motion)
         self._speed = min(arm.tool_speed for arm in arms) / 2  # that of `plan_onward`
 
     def resume(self, motion: Motion) -> None:
         """Go on from the end of ``motion``."""
-        self.motion, self._refused = motion, None
+        self.motion, self._refused, self._room = motion, None, self._room_after(motion)
 
     def towards(self, targets: FloatArray, closed: np.ndarray) -> tuple[Motion | None, str]:
         """The next motion towards ``targets (A, 4, 4)`` with gripper states ``closed (A,)`` bool.
@@ -71,8 +74,22 @@ class Follower:
 
     def _plan(self, poses: FloatArray, closed: np.ndarray) -> Motion:
         actions = Trajectory.from_poses(poses[None], closed[None], self.arms[0].triangle).actions
-        self.motion = plan_onward(actions, self.control_hz, self.motion, self.arms, self.control_hz)
-        return self.motion
+        motion = plan_onward(actions, self.control_hz, self.motion, self.arms, self.control_hz)
+        room = self._room_after(motion)
+        if (closer := room < np.minimum(self._room, -LINK_M)).any():
+            what = "the table" if closer[: len(self.arms)].any() else "the other arm"
+            raise UnreachableError(f"a link of the arm would touch {what}")
+        self.motion, self._room = motion, room
+        return motion
+
+    def _room_after(self, motion: Motion) -> FloatArray:
+        """Distances, metres, of each arm's links from the table, and of each pair of arms, at the end of ``motion``."""
+        shapes = self._shapes
+        links = [shape.at(joints) for shape, joints in zip(shapes, motion.joints[-1], strict=True)]
+        heights = [shape.height(own) for shape, own in zip(shapes, links, strict=True)]
+        pairs = combinations(range(len(shapes)), 2)
+        apart = [shapes[one].distance(links[one], shapes[other], links[other]) for one, other in pairs]
+        return np.concatenate(heights + apart)
 
     def _step(self, here: FloatArray, target: FloatArray) -> FloatArray:
         """The pose one control step from ``here`` towards ``target (4, 4)``."""

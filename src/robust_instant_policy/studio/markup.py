@@ -10,13 +10,19 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image
 
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.policies import Context, LocatedScene, Plan
 
 BLUE, RED, GREEN, ORANGE, GREY = "#2e6f95", "#b3262e", "#2a7d3f", "#b35c00", "#5b6470"
 GOOD, FAIR = 0.9, 0.5  # confidence from which a plan is shown in green, and in orange
+SMALL = "font-size:0.85em;line-height:1.4"
 PICTURE_HEIGHT = "15em"
-KEYPOINT_COLOURS = ("#e6194b", "#3cb44b", "#ffe119", "#4363d8", "#f58231", "#911eb4", "#42d4f4", "#f032e6")
+MARGIN, LEAST_SHARE = 1.4, 0.3  # of the image that is shown: times the box of the keypoints, and at least
+KEYPOINT_PX = 5  # radius of a mark, where the picture is 256 pixels wide
+OBJECT_COLOURS = ("#e6194b", "#ffe119", "#4363d8", "#3cb44b", "#f58231", "#911eb4", "#42d4f4", "#f032e6")
+
+Colour = tuple[int, int, int]
 
 
 def box(colour: str, text: str, name: str = "") -> str:
@@ -29,7 +35,16 @@ def box(colour: str, text: str, name: str = "") -> str:
 
 def line(text: str) -> str:
     """HTML of a line of ``text``."""
-    return f'<div style="padding:0 0.8em">{html.escape(text)}</div>'
+    return f'<div style="padding:0.2em 0.8em;{SMALL}">{html.escape(text)}</div>'
+
+
+def legend(*entries: tuple[str, Colour, str]) -> str:
+    """HTML that explains colours: a name, its colour, and what more is to be said, for each of ``entries``."""
+    marks = (
+        f'<span style="color:rgb{colour}">&#9632;</span> {html.escape(name)}{html.escape(more and f" ({more})")}'
+        for name, colour, more in entries
+    )
+    return f'<div style="padding:0.2em 0.8em;{SMALL}">{", ".join(marks)}</div>'
 
 
 def prompt(text: str) -> str:
@@ -37,7 +52,7 @@ def prompt(text: str) -> str:
     return f'<pre style="max-height:20em;overflow:auto;font-size:0.75em;padding:0 0.8em">{html.escape(text)}</pre>'
 
 
-def comparison(rows: Sequence[tuple[str, tuple[int, int, int], str]]) -> str:
+def comparison(rows: Sequence[tuple[str, Colour, str]]) -> str:
     """HTML of a table with a method, its colour and its outcome in each of ``rows``."""
     cells = (
         f'<tr><td style="color:rgb{colour};font-weight:bold;padding-right:1em">{html.escape(method)}</td>'
@@ -55,12 +70,12 @@ def trust(plan: Plan, available: int) -> str:
     words = f"Confidence {confidence:.2f}: {len(plan.candidates)} of {available} candidates"
     words += f", hallucinated: {', '.join(ignored)}" if ignored else ", none hallucinated"
     evidence = "".join(
-        f"<tr><td style='padding-right:1em'>{html.escape(name)}</td><td>{value:.3g}</td></tr>"
+        f"<tr><td style='padding-right:1em'>{html.escape(name)}</td><td>{round(value, 3):g}</td></tr>"
         for name, value in plan.evidence.items()
     )
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in plan.notes)
     return (
-        f"{box(colour, words)}<details style='padding:0 0.8em'><summary>Reasons</summary>"
+        f"{box(colour, words)}<details style='padding:0 0.8em;{SMALL}'><summary>Reasons</summary>"
         f"<table>{evidence}</table><ul style='padding-left:1.2em'>{notes}</ul></details>"
     )
 
@@ -71,29 +86,37 @@ def keypoint_picture(rgb: np.ndarray, context: Context | None = None, scene: Loc
     with io.BytesIO() as buffer:
         Image.fromarray(rgb).save(buffer, "JPEG", quality=88)
         data = base64.b64encode(buffer.getvalue()).decode()
-    marks = []
+    part, marks = np.array([0.0, 0.0, width, height]), []
     if context is not None and scene is not None:
-        size = width / 256
-        for index, (u, v) in enumerate(scene.located.pixels + 0.5):
-            told = html.escape(_known(context, scene, index))
-            colour = KEYPOINT_COLOURS[index % len(KEYPOINT_COLOURS)]
+        pixels = scene.located.pixels + 0.5
+        part = _around(pixels, width, height)
+        size = part[2] / 256
+        for index, (u, v) in enumerate(pixels):
+            told, colour = _known(context, scene, index)
             marks.append(
-                f'<g class="keypoint"><title>{told}</title><circle cx="{u:.1f}" cy="{v:.1f}" r="{5 * size:.1f}" '
-                f'fill="{colour}" stroke="#000" stroke-width="{size:.1f}"/><text x="{u:.1f}" y="{v + 2.4 * size:.1f}" '
-                f'font-size="{7 * size:.1f}" text-anchor="middle">{index}</text></g>'
+                f'<circle class="keypoint" cx="{u:.1f}" cy="{v:.1f}" r="{KEYPOINT_PX * size:.1f}" fill="{colour}" '
+                f'stroke="#000" stroke-width="{size:.1f}"><title>{html.escape(told)}</title></circle>'
             )
     return (
-        f'<svg viewBox="0 0 {width} {height}" style="width:100%;max-height:{PICTURE_HEIGHT};border-radius:6px">'
+        f'<svg viewBox="{" ".join(f"{number:.1f}" for number in part)}" '
+        f'style="width:100%;max-height:{PICTURE_HEIGHT};border-radius:6px">'
         f'<image href="data:image/jpeg;base64,{data}" width="{width}" height="{height}"/>{"".join(marks)}</svg>'
     )
 
 
-def _known(context: Context, scene: LocatedScene, index: int) -> str:
-    """What is known of a keypoint: its object, how sure it is here, and in the demonstrations."""
-    sure = f"here {scene.located.confidence[index]:.2f}"
+def _around(pixels: FloatArray, width: int, height: int) -> FloatArray:
+    """Left, top, width and height ``(4,)`` of the part of an image around ``pixels (K, 2)``, in its proportions."""
+    size, low, high = np.array([width, height]), pixels.min(axis=0), pixels.max(axis=0)
+    shown = size * np.clip(MARGIN * ((high - low) / size).max(), LEAST_SHARE, 1.0)
+    return np.concatenate([((low + high - shown) / 2).clip(0, size - shown), shown])
+
+
+def _known(context: Context, scene: LocatedScene, index: int) -> tuple[str, str]:
+    """What is known of a keypoint, and its colour: its object, how sure it is here, and in the demonstrations."""
+    sure = f"confidence here {scene.located.confidence[index]:.2f}"
     if not isinstance(context.extractor, KeypointExtractor):
-        return f"keypoint {index}: confidence {sure}"
+        return f"keypoint {index}: {sure}", OBJECT_COLOURS[0]
+    thing = int(context.extractor.object_of_[index])
     shown = ", ".join(f"{value:.2f}" for value in context.extractor.confidence_[:, index])
-    return (
-        f"keypoint {index} on object {context.extractor.object_of_[index]}: confidence {sure}; demonstrations {shown}"
-    )
+    told = f"keypoint {index} on object {thing}: {sure}, in the demonstrations {shown}"
+    return told, OBJECT_COLOURS[thing % len(OBJECT_COLOURS)]

@@ -42,6 +42,8 @@ HOW_TO = """
 3. Once the task is done, **Enter** keeps the demonstration; the next scene comes.
 
 **Z** goes back one second, **X** begins again. **I J K L** shift, **U O** up and down, **N M** turn.
+
+The arm stops at the table, but not at the objects: a link may push one.
 """
 
 
@@ -164,7 +166,7 @@ class Page:
         keep = gui.add_button("Keep (Enter)", icon=viser.Icon.CHECK, color="green")
         keep.on_click(held(self._keep))
         grip = gui.add_button("Close / open gripper (Space)", icon=viser.Icon.ARROWS_HORIZONTAL)
-        grip.on_click(held(lambda _: session.post(lambda: session.grip(self._arm))))
+        grip.on_click(held(lambda _: session.post(partial(session.grip, self._arm))))
         undo = gui.add_button("Undo (Z)", icon=viser.Icon.ARROW_BACK_UP)
         self._back = gui.add_slider("Undo by, s", min=0.5, max=10.0, step=0.5, initial_value=UNDO_S)
         undo.on_click(held(lambda _: session.post(lambda: session.undo(self._back.value))))
@@ -202,7 +204,7 @@ class Page:
             self.demonstrations = stored_demonstrations(folder, task, MANY) if folder.exists() else []
             self._count()
             cell = self._make_cell(task, self.demonstrations)
-            for control in self._with_arms:
+            for control in (*self._with_arms, *self._acts.with_arms):
                 control.visible = bool(cell.arms)
             self.session.open(cell)
             self._new_scene()
@@ -265,7 +267,7 @@ class Page:
         now, before = time.monotonic(), self._gripped_at
         self._gripped_at = now
         if now - before > KEY_REPEAT_S:
-            self.session.post(lambda: self.session.grip(self._arm))
+            self.session.post(partial(self.session.grip, self._arm))
 
     def _choose_arm(self) -> None:
         self._arm = (self._arm + 1) % max(len(self._grippers), 1)
@@ -277,7 +279,7 @@ class Page:
         yaw = np.round(np.arctan2(look[1], look[0]) / (np.pi / 2)) * np.pi / 2 - np.pi / 2
         shift = Rotation.from_euler("z", yaw).as_matrix() @ np.array(way) * NUDGE_M
         rotation = Rotation.from_euler("z", turn * NUDGE_RAD).as_matrix()
-        self.session.post(lambda: self.session.nudge(self._arm, shift, rotation))
+        self.session.post(partial(self.session.nudge, self._arm, shift, rotation))
 
     def _situation(self, status: Status) -> tuple[str, str]:
         """Colour and words for what goes on."""

@@ -14,7 +14,8 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import CONFIGS, Plan, Settings
 from robust_instant_policy.studio import markup
 from robust_instant_policy.studio.controls import Controls
-from robust_instant_policy.studio.plan_view import PlanView
+from robust_instant_policy.studio.drawing import FOLLOWED
+from robust_instant_policy.studio.plan_view import DEMONSTRATION, GAUSSIAN, ROBUST, PlanView
 from robust_instant_policy.studio.planner import PAPER_ESTIMATOR, Choices, Draft, Planner
 from robust_instant_policy.studio.session import Session
 from robust_instant_policy.studio.stage import Stage
@@ -25,6 +26,12 @@ MOST_NOISE_MM = 40
 ESTIMATORS = ("em", PAPER_ESTIMATOR, "median", "mean")  # those that take milliseconds
 LAYERS = {"Demonstrations": True, "Candidates": True, "Spread": True, "Frames": False}  # name: shown at first
 NOTHING = markup.line("No plan yet.")
+LEGEND = markup.legend(
+    ("robust trajectory", ROBUST, "with its spread"),
+    ("Gaussian mean", GAUSSIAN, ""),
+    ("demonstrations", DEMONSTRATION, ""),
+    ("candidates", FOLLOWED, "the paler, the less they count; dashed where hallucinated"),
+)
 
 
 class PlanPanel:
@@ -60,7 +67,7 @@ class PlanPanel:
         self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
         self._doing = gui.add_html("")
         self._cancel = gui.add_button("Cancel", color="gray", visible=False)
-        self._cancel.on_click(held(lambda _: self.planner.cancel()))
+        self._cancel.on_click(held(lambda _: self._give_up()))
         self._trust = gui.add_html(NOTHING)
         self._queries = gui.add_slider("Candidates Q", min=1, max=MOST_QUERIES, step=1, initial_value=5)
         self._dof = gui.add_slider("ν of the t", min=0.5, max=10.0, step=0.5, initial_value=1.5)
@@ -101,7 +108,7 @@ class PlanPanel:
             if before is not None and np.array_equal(before.rgb, observation.rgb):
                 return  # the same scene again
             self._observation = observation
-            self.planner.cancel("")
+            self.planner.cancel()
             self._forget()
             self._picture.content = markup.keypoint_picture(observation.rgb)
         self._show_points()
@@ -149,6 +156,10 @@ class PlanPanel:
                 self._picture.content = markup.keypoint_picture(self._observation.rgb, draft.context, draft.scene)
         self._draw()
 
+    def _give_up(self) -> None:
+        self.planner.cancel()
+        self._doing.content = markup.line("Planning was cancelled.")
+
     def _end(self, reason: str) -> None:
         self._cancel.visible = self._bar.visible = False
         self._doing.content = ""
@@ -169,14 +180,14 @@ class PlanPanel:
                 return
             choices = self._choices()
             try:
-                plan, gaussian = self._draft.plan(choices), self._draft.plan(choices, dof=np.inf)
+                plan, gaussian = self._draft.plan(choices), self._draft.gaussian(choices)
             except RipError as error:
                 self._session.watcher.on_message(str(error))
                 return
             self._plan = plan
             layers = [name for name, box in self._layers.items() if box.value]
             self._view.show(plan, gaussian, self._demonstrations(), layers, self._draggable.value)
-            self._trust.content = markup.trust(plan, len(self._draft.proposal.candidates))
+            self._trust.content = markup.trust(plan, len(self._draft.proposal.candidates)) + LEGEND
 
     def _drag(self, index: int, at: float, way: FloatArray) -> None:
         with self._lock:

@@ -40,9 +40,14 @@ class PlanView:
         self._remove(self._handles)
 
     def show(
-        self, plan: Plan, gaussian: Plan, demonstrations: Sequence[Demonstration], layers: Collection[str], drag: bool
+        self,
+        plan: Plan,
+        gaussian: Trajectory,
+        demonstrations: Sequence[Demonstration],
+        layers: Collection[str],
+        drag: bool,
     ) -> None:
-        """Draw ``plan``, the ``gaussian`` one of the same candidates, and the ``layers`` that are asked for.
+        """Draw ``plan``, the ``gaussian`` mean of the same candidates, and the ``layers`` that are asked for.
 
         With ``drag`` each candidate of the first arm has a handle.
         """
@@ -55,7 +60,7 @@ class PlanView:
             if "Candidates" in layers:
                 for index in range(len(plan.candidates)):
                     self._line(f"candidate/{arm}/{index}", *drawing.weighed(plan, index, arm), 3.0)
-            self._path(f"gaussian/{arm}", gaussian.trajectory, arm, GAUSSIAN, 3.0)
+            self._path(f"gaussian/{arm}", gaussian, arm, GAUSSIAN, 3.0)
             self._path(f"robust/{arm}", plan.trajectory, arm, ROBUST, 6.0)
             if "Spread" in layers:
                 vertices, faces = drawing.tube(drawing.tool_path(plan.trajectory, arm), drawing.spread(plan, arm))
@@ -82,8 +87,8 @@ class PlanView:
             name = f"/plan/frame/{index}"
             node = self._scene.add_frame(name, axes_length=AXIS_M, axes_radius=0.003)
             place(node, use.pose)
-            words = f"steps {use.first} to {use.last}: {use.words}"
-            self._nodes += [node, self._scene.add_label(f"{name}/label", words)]
+            self._scene.add_label(f"{name}/label", f"steps {use.first} to {use.last}: {use.words}")
+            self._nodes.append(node)  # with its label
 
     def _path(
         self, name: str, trajectory: Trajectory, arm: int, colour: tuple[int, int, int], thickness: float

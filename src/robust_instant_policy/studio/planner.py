@@ -28,7 +28,7 @@ from robust_instant_policy.policies import (
     propose,
     sample,
 )
-from robust_instant_policy.policies.aggregation import take_first
+from robust_instant_policy.policies.aggregation import agree, take_first
 from robust_instant_policy.policies.sampling import MIN_CANDIDATES, NO_SAMPLES
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
@@ -61,10 +61,17 @@ class Draft:
     proposal: Proposal
     prompt: str
 
-    def plan(self, choices: Choices, dof: float | None = None) -> Plan:
-        """The regression on the candidates of ``choices``, in milliseconds; ``dof`` replaces that of ``choices``."""
-        settings = self.settings.changed(dof=dof or choices.dof, estimator=choices.estimator)
+    def plan(self, choices: Choices) -> Plan:
+        """The regression on the candidates of ``choices``, in milliseconds."""
+        settings = self.settings.changed(dof=choices.dof, estimator=choices.estimator)
         return aggregate(self.context, self.scene, self.changed(choices), settings)
+
+    def gaussian(self, choices: Choices) -> Trajectory:
+        """The Gaussian mean (ν = ∞) of the same candidates."""
+        prompt = self.context.prompt.for_scene(self.scene.keypoints)
+        settings = self.settings.changed(dof=math.inf, estimator=choices.estimator)
+        robust = agree(self.changed(choices), settings, prompt.curvature, prompt.variation)
+        return Trajectory(robust.actions, robust.times)
 
     def changed(self, choices: Choices) -> Proposal:
         """The candidates with noise, and where they were dragged to."""
@@ -133,10 +140,10 @@ class Planner:
         work = self._job, tuple(demonstrations), observation, settings, queries
         threading.Thread(target=self._work, args=work, name="planner", daemon=True).start()
 
-    def cancel(self, reason: str = "cancelled") -> None:
-        """End planning for ``reason``; the result of a stage that is under way is dropped."""
+    def cancel(self) -> None:
+        """End planning; the result of a stage that is under way is dropped."""
         self._job += 1
-        self._on_end(reason)
+        self._on_end("")
 
     def _work(
         self,
@@ -148,7 +155,7 @@ class Planner:
     ) -> None:
         def stage(name: str, share: float | None = None) -> None:
             if job != self._job:
-                raise Cancelled("cancelled")
+                raise Cancelled
             self._on_progress(name, share)
 
         try:

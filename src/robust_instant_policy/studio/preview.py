@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -48,7 +49,8 @@ class Preview:
                 }
                 for step in shown
             ]
-            sweep = partial(self._sweep, self._ghost(cell, poses[0]), poses, stopped)
+            moving = [name for name, start in poses[0].items() if any((at[name] != start).any() for at in poses)]
+            sweep = partial(self._sweep, self._ghost(cell, moving), poses, stopped)
         threading.Thread(target=sweep, name="preview", daemon=True).start()
 
     def _sweep_triangle(self, trajectory: Trajectory, stopped: threading.Event) -> None:
@@ -73,9 +75,9 @@ class Preview:
         for node in ghost.values():
             node.remove()
 
-    def _ghost(self, cell: Cell, poses: dict[str, FloatArray]) -> dict[str, Any]:
+    def _ghost(self, cell: Cell, names: Sequence[str]) -> dict[str, Any]:
         ghost = {}
-        for name in poses:
+        for name in names:
             parts = [surface for surface in cell.surfaces() if surface.body == name]
             if parts:
                 starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])

@@ -174,18 +174,18 @@ class Session:
             raise UsageError("nothing is being recorded")
         take = self._take
         take.cut(max(len(take) - round(seconds * self.cell.control_hz), 0))
-        self._draw(self.seed)
-        if not len(take):
-            return
-        self._take = take
-        for command in take.commands:
-            self.cell.advance(command)
-        assert self._follower is not None
-        joints = take.commands[-1].reshape(len(self.cell.arms), -1)
-        end = take.poses[-1][None], take.closed[-1][None]
-        self._follower.resume(Motion(joints[None, :, :-1], joints[None, :, -1], *end))
-        self._targets, self._closed = take.poses[-1].copy(), take.closed[-1].copy()
-        self._set(phase="recording", seconds=len(take) / self.cell.control_hz)
+        self._reset(self.seed)
+        if len(take):
+            self._take = take
+            for command in take.commands:
+                self.cell.advance(command)
+            assert self._follower is not None
+            joints = take.commands[-1].reshape(len(self.cell.arms), -1)
+            end = take.poses[-1][None], take.closed[-1][None]
+            self._follower.resume(Motion(joints[None, :, :-1], joints[None, :, -1], *end))
+            self._targets, self._closed = take.poses[-1].copy(), take.closed[-1].copy()
+            self._set(phase="recording", seconds=len(take) / self.cell.control_hz, failure=self.cell.failure())
+        self._show()
 
     def discard(self) -> None:
         """Begin again in the same scene."""
@@ -281,6 +281,13 @@ class Session:
             pass
 
     def _draw(self, seed: int | None) -> None:
+        self._reset(seed)
+        assert self.cell is not None
+        assert self.observation is not None
+        self.watcher.on_scene(self.cell, self.observation)
+        self._show()
+
+    def _reset(self, seed: int | None) -> None:
         cell = self.cell
         if cell is None or seed is None:
             raise UsageError("there is no scene; choose a task")
@@ -294,8 +301,6 @@ class Session:
             self._follower = Follower(cell.arms, cell.control_hz)
             self._targets = self._follower.motion.poses[-1].copy()
         self.status = Status("ready", closed=tuple(self._closed), failure=cell.failure())
-        self.watcher.on_scene(cell, self.observation)
-        self._show()
 
     def _is_operated(self) -> bool:
         return self.status.phase in ("ready", "recording", "done") and self._follower is not None

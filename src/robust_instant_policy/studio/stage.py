@@ -18,7 +18,7 @@ from robust_instant_policy.studio.cell import Cell, Surface
 GIZMO_M = 0.2
 NEAR_M, FAR_M = 0.1, 20.0
 MOVED = 1e-4  # entries of a pose that change by less are not sent
-EYE, LOOK_AT = (0.0, -0.85, 0.58), (-0.04, 0.03, 0.12)  # of a new browser, m
+EYE, LOOK_AT = (-0.02, -0.88, 0.6), (-0.08, 0.04, 0.14)  # of a new browser, m
 POINT_M = 0.003
 REFUSED = (214, 40, 57)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import os
+import sys
 from pathlib import Path
 
 from robust_instant_policy.errors import CellError
@@ -51,9 +53,14 @@ def make_camera(config: DeviceConfig, relative_to: Path) -> VideoCamera:
 
 
 def load_factory(name: str, where: str):
-    """The callable ``module:name`` that makes a device of one's own."""
+    """The callable ``module:name`` that makes a device of one's own; the module is installed or lies in the working
+    directory."""
     module, _, attribute = name.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
     try:
         return getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
-        raise CellError(f"{where}: factory must be module:function of an installed module: {error}") from None
+        raise CellError(
+            f"{where}: factory must be module:function of a module that is installed or lies in {os.getcwd()}: {error}"
+        ) from None

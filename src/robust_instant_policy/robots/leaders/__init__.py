@@ -1,4 +1,4 @@
-"""Leaders, each behind the protocol of `robots.leader`: leader arms, a keyboard, a gamepad."""
+"""Leaders, each behind the protocol of `robots.leader`: leader arms, a keyboard, a gamepad, a SpaceMouse."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from robust_instant_policy.robots.leaders.gamepad import GamepadSource
 from robust_instant_policy.robots.leaders.jog import JogLeader, KeyboardSource
 from robust_instant_policy.robots.leaders.joint_map import JointMap
 from robust_instant_policy.robots.leaders.lerobot_source import LeRobotSource
+from robust_instant_policy.robots.leaders.spacemouse import SpaceMouseSource
 
 __all__ = ["ArmLeader", "JogLeader", "JointMap", "joint_source", "make_leader"]
 
 ARM_KINDS = ("aloha", "gello", "lerobot")
-JOG_KINDS = ("keyboard", "gamepad")
+JOG_KINDS = ("keyboard", "gamepad", "spacemouse")
 
 
 def make_leader(config: ArmConfig, arm: Arm, rate_hz: float, folder: Path, pressed: Callable[[str], str]) -> Leader:
@@ -37,6 +38,10 @@ def make_leader(config: ArmConfig, arm: Arm, rate_hz: float, folder: Path, press
         device = section.text("device", "/dev/input/js0")
         section.finish()
         return JogLeader(GamepadSource(device, rate_hz), arm)
+    if kind == "spacemouse":
+        device = section.text("device", "")
+        section.finish()
+        return JogLeader(SpaceMouseSource(device, rate_hz), arm)
     source = joint_source(config)  # raises for an unknown kind, too
     file = section.text("calibration", "")
     return ArmLeader(source, _joint_map(kind, file, folder, config.name, len(arm.home)), arm.finger_travel)

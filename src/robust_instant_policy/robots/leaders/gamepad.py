@@ -9,12 +9,12 @@ import numpy as np
 
 from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.robots.leaders.jog import JOG_SPEEDS
 
 EVENT = struct.Struct("=IhBB")  # milliseconds, value, type, number: js_event of linux/joystick.h
 BUTTON, AXIS, INITIAL = 0x01, 0x02, 0x80
 FULL = 32767
 DEAD_ZONE = 0.12  # share of an axis around its middle
-SPEED_M_S, TURN_RAD_S = 0.12, 0.8
 # Sticks of a common gamepad: left stick y, x and right stick y move, right stick x turns about the vertical.
 AXES = {1: (0, -1), 0: (1, -1), 4: (2, -1), 3: (5, -1)}
 GRIPPER_BUTTON = 0
@@ -47,8 +47,7 @@ class GamepadSource:
                 index, direction = AXES[number]
                 share = direction * value / FULL
                 self._axes[index] = 0.0 if abs(share) < DEAD_ZONE else share
-        speed = np.array([SPEED_M_S] * 3 + [TURN_RAD_S] * 3)
-        return self._axes * speed / self._rate, presses % 2 == 1
+        return self._axes * JOG_SPEEDS / self._rate, presses % 2 == 1
 
     def disconnect(self) -> None:
         if self._file >= 0:

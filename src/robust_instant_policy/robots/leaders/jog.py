@@ -1,4 +1,4 @@
-"""Leaders that move the tool by steps: a keyboard or a gamepad."""
+"""Leaders that move the tool by steps: a keyboard, a gamepad or a SpaceMouse."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from robust_instant_policy.motion.arm import Arm
 from robust_instant_policy.motion.state import ArmState, Command, is_gripping
 
 LEAD_M, LEAD_RAD = 0.03, 0.3  # by which the wanted tool pose may be ahead of the measured one
+JOG_SPEEDS = np.array([0.12] * 3 + [0.8] * 3)  # m/s and rad/s of axes that are pushed fully
 REACHED_M = 0.003  # a pose that the arm misses by more is not commanded
 
 
