@@ -132,6 +132,7 @@ def test_depth_is_in_metres_and_aligned_to_the_colour_image(connected, one_modul
     assert near[0] == pytest.approx(expected[0], abs=3)
     assert near[-1] == pytest.approx(expected[1], abs=3)
     assert np.median(row[400:600]) == pytest.approx(0.8, abs=0.001)
+    assert np.abs(camera.preview() - 120.0).max() <= 2  # the colour image alone
 
 
 def test_each_image_is_taken_after_the_call_and_has_a_later_time(connected):
