@@ -29,6 +29,7 @@ SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enab
 SIZE, FILM_SIZE = (1200, 720), (880, 528)
 FRAME_S = 0.15  # of the film
 FILM_S = 24.0  # the page is shown faster if it took longer
+END_S = 1.5  # of the film, on the last picture
 LONGEST_STILL_S = 0.8  # of the page; longer ones, while the model is asked, are cut
 QUALITY = 55
 KEYS = {"x": "lj", "y": "ik", "z": "uo"}  # forward and back
@@ -56,7 +57,7 @@ class Camera:
         taken = np.array([at for at, _ in self.frames])
         shown = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(taken), LONGEST_STILL_S))])
         shown *= min(1.0, FILM_S / shown[-1])
-        chosen = np.searchsorted(shown, np.arange(0.0, shown[-1], FRAME_S), side="right") - 1
+        chosen = np.searchsorted(shown, np.arange(0.0, shown[-1] + END_S, FRAME_S), side="right") - 1
         return [self.frames[index][1].resize(FILM_SIZE, Image.Resampling.LANCZOS) for index in chosen]
 
 
