@@ -26,15 +26,17 @@ Row = dict[str, Any]
 
 
 def hard(tasks: list[str], split: str, scenes: int, data: Path, rows: Path, table: Path) -> None:
-    """Measure what ``rows`` lacks of ``tasks`` in so many ``scenes`` of a ``split``, and write the ``table``."""
+    """Measure what ``rows`` lacks of ``tasks`` in so many ``scenes`` of a ``split``, and write the ``table`` of all its
+    rows of these.
+    """
     seeds = [scene_seed(0, index, split) for index in range(scenes)]
     for name in tasks:
-        known = {row["seed"] for row in _read(rows) if row["task"] == name}
+        known = {row["seed"] for row in _read(rows) if row["task"] == name and row["split"] == split}
         for row in _measure(name, [seed for seed in seeds if seed not in known], data):
             rows.parent.mkdir(parents=True, exist_ok=True)
             with rows.open("a") as file:
-                file.write(json.dumps(row) + "\n")
-    found = [row for row in _read(rows) if row["task"] in tasks and row["seed"] in seeds]
+                file.write(json.dumps({"split": split} | row) + "\n")
+    found = [row for row in _read(rows) if row["task"] in tasks and row["split"] == split]
     text = "\n".join(_table(found, tasks)) + "\n"
     table.write_text(text)
     print(text)
@@ -77,8 +79,8 @@ def _read(rows: Path) -> list[Row]:
 
 def _table(rows: list[Row], tasks: list[str]) -> list[str]:
     lines = [
-        "| task | keypoints on moving objects | within 20 mm | median error | 90th percentile | AUROC |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| task | scenes | keypoints on moving objects | within 20 mm | median error | 90th percentile | AUROC |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name, which in [*((task, [task]) for task in tasks), ("all", tasks)]:
         chosen = [row for row in rows if row["task"] in which and row["parts"]]
@@ -90,7 +92,7 @@ def _table(rows: list[Row], tasks: list[str]) -> list[str]:
         told = auroc(confidence, errors < RIGHT_M)
         count, right = f"{len(errors) / len(chosen):.1f} of {len(on) / len(chosen):.0f}", (errors < RIGHT_M).mean()
         lines.append(
-            f"| {name} | {count} | {right:.0%} "
+            f"| {name} | {len(chosen)} | {count} | {right:.0%} "
             f"| {np.median(errors) * 1e3:.1f} mm | {np.percentile(errors, 90) * 1e3:.1f} mm "
             f"| {'—' if np.isnan(told) else f'{told:.2f}'} |"
         )

@@ -174,3 +174,21 @@ def test_a_thing_that_a_rod_hides_in_part_is_one_thing_and_found():
     errors = np.linalg.norm(places[:, :2] - extractor.keypoints_[0, :, :2] - moved, axis=1)
     assert np.median(errors) < 0.005
     assert errors.max() < 0.02
+
+
+def test_of_two_alike_things_each_is_where_both_together_explain_the_image():
+    """A rod hides a part of the smaller one, so that this alone fits better where the larger one is."""
+
+    def scene(seed: int, *rod_at: float):
+        (x, y), (u, v) = places(seed, 2)
+        blue, dark = ((40, 90, 180), (40, 90, 180)), ((15, 15, 15), (15, 15, 15))
+        blocks = [(x, y, 0.035, 0.05, blue), (u, v, 0.030, 0.05, blue)]
+        rod = [(rod_x, rod_y, 0.008, 0.3, dark) for rod_x in rod_at for rod_y in np.arange(-0.4, 0.41, 0.012)]
+        return blocks, photograph([*blocks, *rod], size=256)
+
+    scenes = [scene(seed) for seed in range(3)]
+    extractor = KeypointExtractor(features="efficientnet").fit([image for _, image in scenes])
+    blocks, image = scene(18, -0.1264)
+    known = owners(extractor.pixels_[0], scenes[0][1], scenes[0][0])
+    assert set(known) == {0, 1}
+    assert owners(extractor.locate(image).pixels, image, blocks) == known

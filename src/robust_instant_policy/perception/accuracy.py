@@ -158,7 +158,7 @@ def _part_of(pixels: FloatArray, known: Sequence[KnownScene], moving: set[str]) 
 
 def _extent(observation: Observation, scene: KnownScene, part: str) -> FloatArray:
     """Lower and upper corner ``(2, 3)`` of the visible part in its own frame, metres; NaN where none is visible."""
-    seen = scene.parts == scene.names.index(part)
+    seen = (scene.parts == scene.names.index(part)) & (observation.depth > 0)  # 0 and NaN are no reading
     if not seen.any():
         return np.full((2, 3), np.nan)
     pixels = np.argwhere(seen)[:, ::-1]
