@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError, UnknownNameError
@@ -37,6 +38,10 @@ SAME_SHAPE_FITNESS = 0.7  # from which keypoints need no registration of their o
 SCENERY_WEIGHT = 0.2  # of what never moves, beside what does
 HAND_SHOWN = 0.8  # share of the images from which on what lies at the start of the path is a hand
 NEIGHBOURHOOD_M = 0.04  # around a keypoint, for a registration of its own
+
+
+# Registration multiplies many small matrices: threads of BLAS wait for each other there, at three times the time.
+one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +90,7 @@ class KeypointExtractor:
         self.correspondence = correspondence
         self._shared: SharedDescriptors | None = None
 
+    @one_blas_thread
     def fit(
         self, observations: Sequence[Observation], trajectories: Sequence[Trajectory] | None = None
     ) -> KeypointExtractor:
@@ -161,6 +167,7 @@ class KeypointExtractor:
         self.confidence_ = self._shared.agreement()
         return self
 
+    @one_blas_thread
     def locate(self, observation: Observation) -> Located:
         """The keypoints in a new image.
 
