@@ -1,5 +1,7 @@
 """Keypoints on tables with several things: blocks of two colours, seen from above by a pinhole camera."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -131,6 +133,27 @@ def test_a_gripper_in_the_image_gets_no_keypoints_and_is_told():
     located = extractor.locate(images[4])
     assert set(owners(located.pixels, images[4], scenes[4])) == {0}
     assert any("arm is in the image" in note for note in located.notes)
+
+
+@pytest.mark.parametrize("beside", [0, 1])
+def test_what_the_border_cuts_off_is_a_thing_where_there_is_nothing_else(beside):
+    def scene(y: float):
+        """A ramp that rises to 0.2 m at the border of the image, and ``beside`` blocks."""
+        blocks = blocks_at(0, halves=(0.035,) * beside)
+        image = photograph(blocks)
+        rows, cols = np.indices(image.depth.shape)
+        x, at_y = (cols - 99.5) / 250, -(rows - 99.5) / 250
+        height = np.where(abs(at_y - y) < 0.06, np.clip(x - 0.2, 0, None), 0)
+        rgb = np.where((height > 0)[..., None], np.where((x < 0.3)[..., None], *COLOURS[1]), image.rgb).astype(np.uint8)
+        return blocks, replace(image, depth=(image.depth - height).astype(np.float32), rgb=rgb)
+
+    (blocks, first), (_, second) = scene(0.0), scene(0.1)
+    extractor = KeypointExtractor(features="efficientnet").fit([first, second])
+    if beside:
+        assert set(owners(extractor.pixels_[0], first, blocks)) == {0}
+    else:
+        assert (extractor.pixels_[0][:, 0] > 140).all()
+    assert any("not for an arm" in note for note in extractor.locate(second).notes) == (not beside)
 
 
 def test_a_small_thing_in_a_box_of_its_colour_is_an_object_of_its_own():

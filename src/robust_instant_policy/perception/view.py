@@ -70,6 +70,10 @@ REASONS = {
     UNRELATED: "no object that all demonstrations show",
     HAND: "the gripper where the demonstrations start",
 }
+CUT_OFF_NOTE = (
+    "all that stands on the table reaches over the image's border: it is taken for the task's object, not for an arm; "
+    "show the whole of it, and park the arm outside the image"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +193,7 @@ def make_view(
     label[foreground] = connected_pieces(points[foreground], max(GAP_M, GAP_PX * stride * pixel_m))
     _join_hidden(label, points, usable)
     label[(label >= 0) & np.isin(label, label[of_hand])] = HAND
-    _leave_out_arms(label, heights, pixels)
+    cut_off = _leave_out_arms(label, heights, pixels, least)
     _join_behind(label, points, usable, observation.rgb[pixels[:, 1], pixels[:, 0]] / 255)
     small = _leave_out_small(label, heights, pixels, least)
 
@@ -213,7 +217,7 @@ def make_view(
     arm = ""
     if (labels == HAND).any() or (labels == BORDER).mean() > TOLD_BORDER_SHARE:
         arm = "an arm is in the image: it is left out, and what it hides is not seen; park it outside the image"
-    notes = tuple(line for line in (note, small, arm) if line)
+    notes = tuple(line for line in (note, small, cut_off, arm) if line)
     return View(
         observation,
         descriptors,
@@ -330,14 +334,21 @@ def _join_hidden(label: IntArray, points: FloatArray, usable: NDArray[np.bool_])
     label[label >= 0] = connected_components(graph, directed=False)[1][label[label >= 0]]
 
 
-def _leave_out_arms(label: IntArray, heights: FloatArray, pixels: IntArray) -> None:
-    """Mark in ``label (N,)`` the pieces that reach in over the border."""
+def _leave_out_arms(label: IntArray, heights: FloatArray, pixels: IntArray, least: int) -> str:
+    """Mark in ``label (N,)`` the pieces that reach in over the border; returns a note where one is kept.
+
+    A thing that the border cuts off looks like an arm. It is kept where there is nothing else, of ``least`` points or
+    more, and it comes down to the table.
+    """
     first, last = pixels.min(axis=0), pixels.max(axis=0)
     margin = np.maximum((last - first) * BORDER_SHARE, 1)
     crossing = ((pixels < first + margin) | (pixels > last - margin)).any(axis=1) & (label >= 0)
-    for piece in np.unique(label[crossing]):
-        if heights[crossing & (label == piece)].min() > HOVERING_M:
-            label[label == piece] = BORDER
+    over = [piece for piece in np.unique(label[crossing]) if heights[crossing & (label == piece)].min() > HOVERING_M]
+    others = np.bincount(label[(label >= 0) & ~np.isin(label, over)], minlength=1)
+    standing = [piece for piece in over if heights[label == piece].min() < HOVERING_M]
+    alone = bool(standing) and others.max() < least
+    label[np.isin(label, [piece for piece in over if not (alone and piece in standing)])] = BORDER
+    return CUT_OFF_NOTE if alone else ""
 
 
 def _join_behind(label: IntArray, points: FloatArray, usable: NDArray[np.bool_], colours: FloatArray) -> None:
