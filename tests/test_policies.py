@@ -22,6 +22,7 @@ from robust_instant_policy.policies.confidence import (
     distortion,
     novelty,
     plan_confidence,
+    prediction,
     recognition,
 )
 from robust_instant_policy.policies.context import HARDLY_RECOGNISED
@@ -235,6 +236,14 @@ def test_a_tie_or_an_error_of_a_check_leaves_no_confidence():
 def test_what_cannot_be_known_bounds_the_confidence(unknown):
     assert plan_confidence(replace(SURE, **unknown)) == UNKNOWN
     assert len(replace(SURE, **unknown).unknown_notes) == 1
+
+
+def test_free_starts_and_ends_without_gripper_changes_are_not_unexplained():
+    ends = np.array([[0.2, 0.001]] * 5)
+    best, worst = prediction(ends)
+    assert best == 0.001
+    assert np.isnan(worst)
+    assert prediction(np.array([[0.0, 0.004, 0.08, 0.3]] * 5)) == (0.004, 0.08)
 
 
 def test_demonstrations_of_one_scene_tell_nothing_about_others():

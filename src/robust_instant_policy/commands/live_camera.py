@@ -29,7 +29,7 @@ from PIL import Image
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import DatasetError, RipError, RobotError
+from robust_instant_policy.errors import RipError, RobotError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.network import is_loopback
 from robust_instant_policy.perception import KeypointExtractor
@@ -44,6 +44,7 @@ MOST_SHARE = 0.2  # of the camera's time for them
 JPEG_QUALITY = 80
 NICE = 5  # the process that commands the arms goes first
 STARTING_S, READING_S = 60.0, 40.0
+SIGNALS = (signal.SIGINT, signal.SIGHUP)
 
 
 class LiveCamera:
@@ -57,40 +58,48 @@ class LiveCamera:
         self.name, self.url = config.kind, ""
         context = multiprocessing.get_context("spawn")
         self._wire, self._theirs = context.Pipe()
+        self._sending = threading.Lock()
         device = (config.kind, dict(config.options), config.where)
         self._process = context.Process(
             target=_serve, args=(self._theirs, device, folder, demos, workspace), daemon=True, name="camera"
         )
 
     def connect(self) -> None:
-        self._process.start()
+        # Ctrl-C is the recording process's, also while the other one starts, which inherits what is blocked.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         self._theirs.close()  # so that the end of the process ends the pipe
         self.name, self.url = self._answer(STARTING_S)
 
     def read(self) -> Frame:
-        with contextlib.suppress(OSError):  # the answer tells that the process has ended
-            self._wire.send(("read", None))
+        if not self._sending.acquire(timeout=READING_S):
+            raise RobotError(f"camera {self.name} takes no more requests; connect it again")
+        self._sending.release()
+        self._send("read", None)  # the answer tells where the process has ended
         frame: Frame = self._answer(READING_S)
         return frame
 
     def show(self, start: Observation) -> None:
         """Mark the keypoints of the demonstrations in the ``start`` image, once they are found."""
-        self._tell("start", start)
+        threading.Thread(target=self._send, args=("start", start), daemon=True).start()  # megabytes
 
     def say(self, line: str) -> None:
         """Show what the person was told last. Never waits."""
-        self._tell("line", line)
+        with contextlib.suppress(OSError):  # it may be closed
+            if not self._sending.locked() and select.select([], [self._wire], [], 0)[1]:
+                self._send("line", line)
 
     def disconnect(self) -> None:
         self._wire.close()  # it ends then
         self._process.join(5.0)
         self._process.kill()
 
-    def _tell(self, what: str, value: object) -> None:
-        """The page is no reason to stop an arm, or to wait."""
-        with contextlib.suppress(OSError):
-            if select.select([], [self._wire], [], 0)[1]:
-                self._wire.send((what, value))
+    def _send(self, what: str, value: object) -> None:
+        with self._sending, contextlib.suppress(OSError):  # the page is no reason to stop an arm
+            self._wire.send((what, value))
 
     def _answer(self, seconds: float) -> Any:
         try:
@@ -108,8 +117,9 @@ def _serve(
     wire: Connection, device: tuple[str, Mapping[str, Any], str], folder: Path, demos: Path, workspace: FloatArray
 ) -> None:
     """Read the camera and show it until ``wire`` is closed; a text sent over it is an error's message."""
-    for number in (signal.SIGINT, signal.SIGHUP):  # the recording process stops the arms first
+    for number in SIGNALS:  # the recording process stops the arms first
         signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     os.nice(NICE)
     page = _Page(demos, workspace)
     try:
@@ -140,6 +150,7 @@ def _work(wire: Connection, camera: VideoCamera, page: _Page) -> None:
             elif what == "line":
                 page.line = value
             else:
+                page.newest = value
                 page.show(picture(value.rgb, "start image"))
                 threading.Thread(target=page.find_keypoints, args=(value,), daemon=True).start()
             continue
@@ -147,7 +158,7 @@ def _work(wire: Connection, camera: VideoCamera, page: _Page) -> None:
         try:
             page.live = _jpeg(camera.preview())
             page.error = ""
-        except RipError as error:
+        except Exception as error:  # of whatever library: the camera may be read all the same
             page.error = str(error)
         now = time.monotonic()
         due = now + max(LIVE_S, (now - began) / MOST_SHARE)
@@ -160,7 +171,8 @@ class _Page:
         self._demos, self._workspace = demos, workspace
         self.live, self.line, self.error = b"", "", ""
         self.start: Picture | None = None
-        self.shown = 0  # start images so far, by which the browser knows a new one
+        self.shown = 0  # pictures so far, by which the browser knows a new one
+        self.newest: Observation | None = None
 
     def show(self, start: Picture) -> None:
         self.start = start
@@ -168,22 +180,24 @@ class _Page:
 
     def find_keypoints(self, seen: Observation) -> None:
         """Mark the keypoints of the demonstrations so far in a start image, or say why there are none."""
+        marked = self._with_keypoints(seen)
+        if seen is self.newest:
+            self.show(marked)
+
+    def _with_keypoints(self, seen: Observation) -> Picture:
+        if not self._demos.exists():
+            return picture(seen.rgb, "start image; its keypoints are shown once there is a demonstration")
         try:
             recorded = load_demonstrations(self._demos)
-        except DatasetError:
-            self.show(picture(seen.rgb, "start image; its keypoints are shown once there is a demonstration"))
-            return
-        try:
             extractor = KeypointExtractor(workspace=self._workspace)
             extractor.fit([one.observation for one in recorded], [one.trajectory for one in recorded])
             located = extractor.locate(seen)
         except RipError as error:  # too few demonstrations so far, too little in common, or a missing package
-            self.show(picture(seen.rgb, f"start image; no keypoints yet: {error}"))
-            return
+            return picture(seen.rgb, f"start image; no keypoints yet: {error}")
         low, high = located.confidence.min(), located.confidence.max()
         words = f"start image with the keypoints of the demonstrations so far ({len(recorded)}), confidence"
         caption = "; ".join((f"{words} {low:.2f} to {high:.2f}", *located.notes))
-        self.show(picture(seen.rgb, caption, marks=keypoint_marks(located.pixels, located.confidence)))
+        return picture(seen.rgb, caption, marks=keypoint_marks(located.pixels, located.confidence))
 
 
 def _handler(page: _Page) -> type[BaseHTTPRequestHandler]:
@@ -205,12 +219,12 @@ def _handler(page: _Page) -> type[BaseHTTPRequestHandler]:
                 self._send(404, "text/plain", b"not here")
 
         def _send(self, status: int, kind: str, content: bytes) -> None:
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(content)))
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
             with contextlib.suppress(OSError):  # the browser went away
+                self.send_response(status)
+                self.send_header("Content-Type", kind)
+                self.send_header("Content-Length", str(len(content)))
+                self.send_header("Cache-Control", "no-store")
+                self.end_headers()
                 self.wfile.write(content)
 
         def log_message(self, format: str, *arguments: object) -> None:

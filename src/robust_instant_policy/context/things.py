@@ -137,7 +137,7 @@ def _located(thing: Thing, keypoints: FloatArray, found: Scene) -> Located:
         ratio = ratio / (np.abs(_complex(thing.shape)) ** 2).sum()
         return Located(rotations_about_vertical(np.angle(ratio)), middle, np.abs(ratio), unit)
     poses, hand, _ = _fit_either_hand(thing.shape, points, thing.kind == "upright", thing.mirrors)
-    return Located(poses[:, :3, :3], poses[:, :3, 3], _rms_radius(points) / _rms_radius(thing.shape[None]), hand)
+    return Located(poses[:, :3, :3], poses[:, :3, 3], _rms_radius(points, 3) / _rms_radius(thing.shape[None], 3), hand)
 
 
 def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
@@ -226,9 +226,10 @@ def _scaled(keypoints: FloatArray, tolerance: float) -> list[Thing]:
     return things
 
 
-def _rms_radius(points: FloatArray) -> FloatArray:
-    flat = points[..., :2] - points[..., :2].mean(axis=1, keepdims=True)
-    return np.sqrt((flat**2).sum(axis=-1).mean(axis=-1))
+def _rms_radius(points: FloatArray, dimensions: int = 2) -> FloatArray:
+    """Of ``points (I, N, 3)``, seen from above or in space: ``(I,)``, metres."""
+    seen = points[..., :dimensions] - points[..., :dimensions].mean(axis=1, keepdims=True)
+    return np.sqrt((seen**2).sum(axis=-1).mean(axis=-1))
 
 
 def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) -> list[Thing]:

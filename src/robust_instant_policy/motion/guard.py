@@ -169,8 +169,8 @@ class Space:
         pair = int(np.argmin((apart - least).min(axis=0)))
         one, other = (shape.links[shape_index] for shape_index in shape.pairs[:, pair])
         what = f"the distance between its links {one} and {other} is"
-        _refuse(least[pair] - apart[:, pair], apart[:, pair], limit, self._arms[index], what, "m", "link_distance",
-                rate_hz)  # fmt: skip
+        _refuse(least[pair] - apart[:, pair], apart[:, pair], float(least[pair]), self._arms[index], what, "m",
+                "link_distance", rate_hz)  # fmt: skip
 
     def outside(self, joints: FloatArray) -> FloatArray:
         """How far, metres, each tool is outside the workspace at ``joints (N, A, J)``: ``(N, A)``, 0 inside."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,8 +42,18 @@ HAND_SHOWN = 0.8  # share of the images from which on what lies at the start of 
 NEIGHBOURHOOD_M = 0.04  # around a keypoint, for a registration of its own
 
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
 # Registration multiplies many small matrices: threads of BLAS wait for each other there, at three times the time.
-one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+def one_blas_thread(method: Callable[P, T]) -> Callable[P, T]:
+    @wraps(method)
+    def limited(*arguments: P.args, **options: P.kwargs) -> T:
+        with threadpool_limits(limits=1, user_api="blas"):
+            return method(*arguments, **options)
+
+    return limited
 
 
 @dataclass(frozen=True, eq=False)

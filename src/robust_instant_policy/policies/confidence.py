@@ -150,9 +150,11 @@ def prediction(errors: FloatArray) -> tuple[float, float]:
     worst key step.
 
     The best tells how precise demonstrators are where the gripper meets a thing; elsewhere they vary freely, but not by
-    any amount. The first and the last step count only where there are no others.
+    any amount. The first and the last step count only where there are no others, and then tell no worst.
     """
-    between = np.median(errors[:, 1:-1] if errors.shape[1] > 2 else errors, axis=0)
+    if errors.shape[1] <= 2:
+        return float(np.median(errors, axis=0).min()), float("nan")
+    between = np.median(errors[:, 1:-1], axis=0)
     return float(between.min()), float(between.max())
 
 

@@ -64,7 +64,8 @@ def poses_in(folder: Folder, episode: int, rig: Rig) -> FloatArray | None:
             arms[arm] = poses_of(said, values, columns, rig.position_unit_m, rig.rotation_unit_rad, rig.tool)
         if {"left", "right"} <= arms.keys() or "" in arms:
             break
-    alone = (key for key in where if arm_of(key) not in arms and _is_gripper_position(folder, key))
+    missing = {*ARMS} - arms.keys()
+    alone = (key for key in where if arm_of(key) in missing and _is_gripper_position(folder, key))
     if arms and "" not in arms and (lone := next(alone, None)):
         raise DatasetError(f"{name}: {lone} has no rotation of the same name beside it, such as …_quat")
     return _side_by_side(arms)

@@ -38,6 +38,9 @@ class GamepadSource:
             ) from None
         self._axes = np.zeros(6)
 
+    def start(self) -> None:
+        self.step()
+
     def step(self) -> tuple[FloatArray, bool]:
         presses = 0
         for _, value, kind, number in EVENT.iter_unpack(self._events()):

@@ -24,6 +24,10 @@ class JogSource(Protocol):
 
     def connect(self) -> None: ...
 
+    def start(self) -> None:
+        """Forget what the person did before the arm follows."""
+        ...
+
     def step(self) -> tuple[FloatArray, bool]:
         """Since the last call: the wanted motion ``(6,)``, metres and rotation vector (rad) along the world's axes, and
         whether the gripper was told to open or close."""
@@ -43,6 +47,7 @@ class JogLeader:
         self._source.connect()
 
     def start(self) -> None:
+        self._source.start()
         self._told = None
 
     def read(self, follower: ArmState) -> Command:
@@ -95,6 +100,9 @@ class KeyboardSource:
         self._pressed = pressed
 
     def connect(self) -> None:
+        self.start()
+
+    def start(self) -> None:
         self._pressed(ALL_KEYS)
 
     def step(self) -> tuple[FloatArray, bool]:

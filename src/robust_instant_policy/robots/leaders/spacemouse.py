@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,8 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.robots.leaders.jog import JOG_SPEEDS
 
 DEAD_ZONE = 0.1  # share of an axis around its middle
-MAX_REPORTS = 100  # between two steps; the device sends some 250 a second
+MAX_REPORTS = 100  # read in one step; the device sends some 250 a second while its cap is pushed
+SILENT_S = 0.5  # without a report: the cap is at rest, or the device is out of reach
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")  # x forward, y left, z up (ROS REP 103), as the hand pushes the cap
 HELP = (
     "plug it in; Debian and Ubuntu need the package libhidapi-hidraw0 and a udev rule that lets you read it: "
@@ -40,7 +43,11 @@ class SpaceMouseSource:
                 self._device = pyspacemouse.open(axis_convention=ros)
         except (RuntimeError, ValueError, OSError, AttributeError) as error:  # the last one: HIDAPI is missing
             raise RobotError(f"{self.name} cannot be opened: {error}; {HELP}") from None
-        self._time, self._pressed = -1.0, False
+        self._time, self._pressed, self._heard = -1.0, False, -math.inf
+
+    def start(self) -> None:
+        self.step()
+        self._heard = -math.inf  # the last report may be old: the system keeps the first ones that nobody read
 
     def step(self) -> tuple[FloatArray, bool]:
         presses = 0
@@ -52,9 +59,10 @@ class SpaceMouseSource:
             if state.t == self._time:
                 break  # no new report
             self._time, before, self._pressed = state.t, self._pressed, any(state.buttons)
+            self._heard = time.monotonic()
             presses += self._pressed and not before
         axes = np.array([getattr(state, axis) for axis in AXES])
-        axes[np.abs(axes) < DEAD_ZONE] = 0.0
+        axes[(np.abs(axes) < DEAD_ZONE) | (time.monotonic() - self._heard > SILENT_S)] = 0.0
         return axes.clip(-1.0, 1.0) * JOG_SPEEDS / self._rate, presses % 2 == 1
 
     def disconnect(self) -> None:
