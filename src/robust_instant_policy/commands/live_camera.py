@@ -75,10 +75,7 @@ class LiveCamera:
         self.name, self.url = self._answer(STARTING_S)
 
     def read(self) -> Frame:
-        if not self._sending.acquire(timeout=READING_S):
-            raise RobotError(f"camera {self.name} takes no more requests; connect it again")
-        self._sending.release()
-        self._send("read", None)  # the answer tells where the process has ended
+        self._send("read", None)
         frame: Frame = self._answer(READING_S)
         return frame
 
@@ -98,8 +95,13 @@ class LiveCamera:
         self._process.kill()
 
     def _send(self, what: str, value: object) -> None:
-        with self._sending, contextlib.suppress(OSError):  # the page is no reason to stop an arm
-            self._wire.send((what, value))
+        """A failure is told by `_answer`: what is only shown on the page must not stop an arm."""
+        if self._sending.acquire(timeout=READING_S):
+            try:
+                with contextlib.suppress(OSError):
+                    self._wire.send((what, value))
+            finally:
+                self._sending.release()
 
     def _answer(self, seconds: float) -> Any:
         try:
@@ -228,7 +230,7 @@ def _handler(page: _Page) -> type[BaseHTTPRequestHandler]:
                 self.wfile.write(content)
 
         def log_message(self, format: str, *arguments: object) -> None:
-            """The terminal is the operator's."""
+            """Write nothing to the terminal: the operator reads it."""
 
     return Handler
 

@@ -149,8 +149,8 @@ def prediction(errors: FloatArray) -> tuple[float, float]:
     """Metres, from the errors ``(I, S)`` of `leave_one_out`: the median over the demonstrations at the best and at the
     worst key step.
 
-    The best tells how precise demonstrators are where the gripper meets a thing; elsewhere they vary freely, but not by
-    any amount. The first and the last step count only where there are no others, and then tell no worst.
+    The best tells how precise demonstrators are where the gripper meets a thing; elsewhere they vary more, within
+    limits. The first and the last step count only where there are no others; the worst is then unknown, NaN.
     """
     if errors.shape[1] <= 2:
         return float(np.median(errors, axis=0).min()), float("nan")
