@@ -172,6 +172,14 @@ def find_rivals(
     return Candidates(every, icp(every, *coarse, (), hidden)[1], similarity(every))
 
 
+def polish(
+    motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+) -> tuple[FloatArray, float, float]:
+    """``motion (4, 4)`` after ICP with all points, with its fitness and similarity."""
+    refined, fitness = icp(motion[None], source, _near(motion, source, target), FINE_REACH_M, hidden)
+    return refined[0], float(fitness[0]), float(similarity(refined)[0])
+
+
 def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
     """How an object of the same kind differs in size: an affine map ``(4, 4)`` of its own frame, before ``motion``.
 
