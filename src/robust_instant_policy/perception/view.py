@@ -229,7 +229,10 @@ def make_view(
     _join_hidden(label, points, usable)
     label[(label >= 0) & np.isin(label, label[of_hand])] = HAND
     cut_off = _leave_out_arms(label, heights, pixels, least)
-    _join_behind(label, points, usable, observation.rgb[pixels[:, 1], pixels[:, 0]] / 255)
+    # Above the table, be it left out for that or for being outside the workspace.
+    over = np.zeros(usable.shape, dtype=bool)
+    over[usable] = np.isin(label, (BORDER, HIGH, HAND)) | ((label == OUTSIDE) & (heights > HOVERING_M))
+    _join_behind(label, points, usable, over, observation.rgb[pixels[:, 1], pixels[:, 0]] / 255)
     small = _leave_out_small(label, heights, pixels, least)
 
     labels = np.full(usable.shape, UNKNOWN, dtype=np.int16)
@@ -250,7 +253,7 @@ def make_view(
     cells, cell_points = _cell_points(descriptors.cells_at(pixels[kept]), label, points)
     neighbours = np.setdiff1d([descriptors.shifted(cells, row, col) for row, col in NEIGHBOURS], cells)
     cells = np.concatenate([cells, neighbours])
-    occupied = np.concatenate([points, _filled(observation, depth, labels, stride)])[:, :2]
+    occupied = np.concatenate([points, _filled(observation, depth, labels, over, stride)])[:, :2]
     arm = ""
     if (labels == HAND).any() or (labels == BORDER).mean() > TOLD_BORDER_SHARE:
         arm = "an arm is in the image: it is left out, and what it hides is not seen; park it outside the image"
@@ -286,7 +289,9 @@ def spread_out(points: ArrayLike) -> IntArray:
     return np.unique(_cubes(np.asarray(points), TARGET_M), return_index=True)[1]
 
 
-def _filled(observation: Observation, depth: Float32Array, labels: NDArray[np.int16], stride: int) -> FloatArray:
+def _filled(
+    observation: Observation, depth: Float32Array, labels: NDArray[np.int16], over: NDArray[np.bool_], stride: int
+) -> FloatArray:
     """Points ``(N, 3)``, metres, world, of pixels without a steady depth that are beside a thing and have not the
     table's colour, at the depth of the thing: stereo cameras see no depth on narrow parts.
     """
@@ -294,8 +299,7 @@ def _filled(observation: Observation, depth: Float32Array, labels: NDArray[np.in
     if not table.any():
         return np.zeros((0, 3))
     distance, nearest = distance_transform_edt(~things, return_indices=True)
-    above = np.isin(labels, (BORDER, HIGH, HAND))
-    asked = (labels == UNKNOWN) & (distance <= FILLED_PX / stride) & ~binary_dilation(above, iterations=GAP_PX)
+    asked = (labels == UNKNOWN) & (distance <= FILLED_PX / stride) & ~binary_dilation(over, iterations=GAP_PX)
     colours = observation.rgb[::stride, ::stride]
     smoothed = uniform_filter(observation.rgb, (FILLED_SMOOTHING_PX, FILLED_SMOOTHING_PX, 1))[::stride, ::stride]
     of_table = TableColour.fit(np.divide(colours[table], 255, dtype=np.float32))
@@ -409,9 +413,11 @@ def _leave_out_arms(label: IntArray, heights: FloatArray, pixels: IntArray, leas
     return CUT_OFF_NOTE if alone else ""
 
 
-def _join_behind(label: IntArray, points: FloatArray, usable: NDArray[np.bool_], colours: FloatArray) -> None:
+def _join_behind(
+    label: IntArray, points: FloatArray, usable: NDArray[np.bool_], over: NDArray[np.bool_], colours: FloatArray
+) -> None:
     """Join the pieces in ``label (N,)`` of one of ``colours (N, 3)`` that are apart only where something that is above
-    the table hides what is between them.
+    the table, at the pixels ``over (h, w)``, hides what is between them.
 
     ``points (N, 3)`` are those of the ``usable (h, w)`` pixels.
     """
@@ -419,7 +425,7 @@ def _join_behind(label: IntArray, points: FloatArray, usable: NDArray[np.bool_],
     grid[usable] = label
     number = np.full(usable.shape, -1)
     number[usable] = np.arange(len(points))
-    above = binary_dilation(np.isin(grid, (BORDER, HIGH, HAND)), iterations=GAP_PX) & (grid < 0)
+    above = binary_dilation(over, iterations=GAP_PX) & (grid < 0)
     if not above.any() or not (grid >= 0).any():
         return
     nearest = number[tuple(distance_transform_edt(grid < 0, return_distances=False, return_indices=True))]
