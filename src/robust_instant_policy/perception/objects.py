@@ -13,6 +13,8 @@ from robust_instant_policy.geometry import FloatArray, fit_upright, invert_pose,
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 from robust_instant_policy.perception.parts import MIN_GAIN, candidate_parts, gain
 from robust_instant_policy.perception.registration import (
+    COLOUR_CAP_M,
+    KEPT_COLOUR_CAP_M,
     Candidates,
     Similarity,
     find_rivals,
@@ -33,6 +35,7 @@ SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of
 MIN_TARGET_POINTS = round(MIN_OBJECT_M2 / TARGET_M**2)
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
+KEPT_COLOUR_M = 0.008  # median over images of the distance in colour, for an object that keeps its colours
 HAND_REACH_M = 0.05  # of an object's points, at which a place of the hand counts 1/e
 MIN_NEAR = 0.2
 HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
@@ -105,7 +108,7 @@ class Model:
     """What an object looks like: its ``templates``, the reference image's first; ``parent``: for a part that moves
     against the rest of an object, the number of that, otherwise -1; ``family``: templates of an object with all its
     parts, which tell its turn where it alone is symmetric; whether it ``varies`` in size between images; its ``surroundings``,
-    unless it is a part.
+    unless it is a part; ``colour_cap``, see `icp`.
     """
 
     templates: tuple[Template, ...]
@@ -113,6 +116,7 @@ class Model:
     family: tuple[Template, ...] = ()
     varies: bool = False
     surroundings: Surroundings | None = None
+    colour_cap: float = COLOUR_CAP_M
 
     @property
     def points(self) -> FloatArray:
@@ -196,6 +200,15 @@ def _with_surroundings(thing: RigidObject, views: Sequence[View]) -> RigidObject
     return replace(thing, model=replace(thing.model, surroundings=seen))
 
 
+def _colour_difference(xyzrgb: Float32Array, view: View, pose: FloatArray) -> float:
+    """Median distance in colour, metres as in `View.xyzrgb`, of points ``(N, 6)`` at ``pose`` from those they lie on."""
+    distance, nearest = cKDTree(view.target[:, :3]).query(transform_points(pose, xyzrgb[:, :3]))
+    on = distance < CLAIM_M
+    if not on.any():
+        return float("inf")
+    return float(np.median(np.linalg.norm(xyzrgb[on, 3:] - view.target[nearest[on], 3:], axis=1)))
+
+
 def _aligned(
     model: Model, views: Sequence[View], found: Sequence[Registration], hands: FloatArray | None
 ) -> tuple[list[Registration], Model]:
@@ -214,7 +227,7 @@ def _aligned(
         if hands is not None and near.max() > MIN_NEAR:
             by_hand = fit_upright(hands[0], hands[number], near + 1e-9)[None]
             similarity = _similarity(model.templates, view, _similarities(model.templates, view))
-            by_hand = refine(by_hand, model.templates[0].xyzrgb, view.target, similarity, view.hides).motions
+            by_hand = refine(by_hand, model.templates[0].xyzrgb, view.target, similarity, view.hides, model.colour_cap).motions
         rivals = _alternatives(model, one, view, by_hand)
         prior = (rivals.score - rivals.score.max()) / RIVAL_SCALE
         if hands is not None:
@@ -234,13 +247,17 @@ def _aligned(
             others = np.array([states[k][chosen[k]] for k in range(len(views)) if k < i or (k > i and turn)])
             seen = Surroundings.from_states(cells, grid, others, stretch)
             chosen[i] = int((priors[i] + seen.evidence_in(states[i]) / EVIDENCE_SCALE).argmax())
+    known = model.templates[0].xyzrgb
+    typical = np.median([_colour_difference(known, views[i], poses[i][chosen[i]]) for i in range(1, len(views))])
+    if typical < KEPT_COLOUR_M:
+        model = replace(model, colour_cap=KEPT_COLOUR_CAP_M)
     aligned = [found[0]]
     for i in range(1, len(views)):
         one, pose = found[i], poses[i][chosen[i]]
         if (pose != one.pose).any():
             similarity = _similarity(model.templates, views[i], _similarities(model.templates, views[i]))
             source = model.templates[one.template].xyzrgb
-            pose, fitness, similar = polish(pose, source, views[i].target, similarity, views[i].hides)
+            pose, fitness, similar = polish(pose, source, views[i].target, similarity, views[i].hides, model.colour_cap)
             one = Registration(pose, fitness, similar, one.template)
         aligned.append(one)
     agreed = np.array([states[k][chosen[k]] for k in range(len(views))])
@@ -387,11 +404,11 @@ def _register_model(
         # In one image parts hide some of their object, in all of them nothing.
         whole = np.concatenate([template.surface for template in models[model.parent].templates])
         beside = transform_points(parent.motion, whole)
-        return register(model.templates, view, taken, starts, parent=parent.pose, beside=beside)
-    found = register(model.templates, view, taken, starts)
+        return register(model.templates, view, taken, starts, parent=parent.pose, beside=beside, colour_cap=model.colour_cap)
+    found = register(model.templates, view, taken, starts, colour_cap=model.colour_cap)
     if model.family:
-        family = register(model.family, view, taken)
-        in_family = register(model.templates, view, taken, family.pose[None], vote=False)
+        family = register(model.family, view, taken, colour_cap=model.colour_cap)
+        in_family = register(model.templates, view, taken, family.pose[None], vote=False, colour_cap=model.colour_cap)
         if in_family.score + MUCH_BETTER > found.score:
             found = in_family
     return _decided(model, found, view)
@@ -504,6 +521,7 @@ def register(
     vote: bool = True,
     parent: FloatArray | None = None,
     beside: FloatArray | None = None,
+    colour_cap: float = COLOUR_CAP_M,
 ) -> Registration:
     """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world.
 
@@ -535,8 +553,8 @@ def register(
         candidates = candidates[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
     index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
     source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
-    refined = refine(candidates, source, target, similarity, view.hides)
-    pose = settle_turn(refined.motions[0], source, target, similarity, view.hides)
+    refined = refine(candidates, source, target, similarity, view.hides, colour_cap)
+    pose = settle_turn(refined.motions[0], source, target, similarity, view.hides, colour_cap)
     return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index, refined.motions[1:])
 
 
@@ -544,7 +562,7 @@ def _alternatives(model: Model, found: Registration, view: View, others: FloatAr
     """The pose that was ``found``, its rivals, ``others (S, 4, 4)``, and the first one turned and slid."""
     similarity = _similarity(model.templates, view, _similarities(model.templates, view))
     motions = np.concatenate([found.pose[None], found.rivals, others])
-    return find_rivals(motions, model.templates[found.template].xyzrgb, view.target, similarity, view.hides)
+    return find_rivals(motions, model.templates[found.template].xyzrgb, view.target, similarity, view.hides, model.colour_cap)
 
 
 def _stretched(model: Model, poses: FloatArray, view: View) -> FloatArray:
@@ -573,7 +591,7 @@ def _decided(model: Model, found: Registration, view: View) -> Registration:
     if kept[order[0]] != 0:
         source = model.templates[found.template].xyzrgb
         measured = _similarity(model.templates, view, _similarities(model.templates, view))
-        pose, fitness, similarity = polish(pose, source, view.target, measured, view.hides)
+        pose, fitness, similarity = polish(pose, source, view.target, measured, view.hides, model.colour_cap)
     return replace(
         found,
         pose=pose,
