@@ -39,7 +39,7 @@ KEPT_COLOUR_M = 0.008  # median over images of the distance in colour, for an ob
 HAND_REACH_M = 0.05  # of an object's points, at which a place of the hand counts 1/e
 MIN_NEAR = 0.2
 HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
-MAX_HAND_LOSS = 4.0
+MAX_HAND_LOSS = 12.0
 ALIGNMENT_ROUNDS = 3
 EVIDENCE_SCALE = 8.0  # of the surroundings' evidence: neighbouring cells of the grid are not independent
 MAX_RIVAL_LOSS = 6.0  # in units of RIVAL_SCALE, for a motion that the surroundings may speak for
@@ -152,8 +152,11 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
     pieces = list(home.pieces)
     models = [Model((_template_of(home, piece, seed),)) for piece in pieces]
     found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
+    handled = set()
     if len(views) > 1:
         for number, model in enumerate(models):
+            if hands is not None and _nearness(model, hands[0]).max() > MIN_NEAR:
+                handled.add(number)
             aligned, models[number] = _aligned(model, views, [row[number] for row in found], hands)
             for row, registration in zip(found, aligned, strict=True):
                 row[number] = registration
@@ -180,7 +183,7 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
         members = [i for i, model in enumerate(models) if i == number or model.parent == number]
         family = (_template_of(home, np.concatenate([pieces[i] for i in members]), seed),)
         models[number] = replace(models[number], family=family)
-    things = [_complete(models, found, number, views, seed) for number in range(len(models))]
+    things = [_complete(models, found, number, views, seed, number in handled) for number in range(len(models))]
     shapes = [
         _shapes([thing.model for thing in things], [thing.registrations[i] for thing in things], view)
         for i, view in enumerate(views)
@@ -209,6 +212,11 @@ def _colour_difference(xyzrgb: Float32Array, view: View, pose: FloatArray) -> fl
     return float(np.median(np.linalg.norm(xyzrgb[on, 3:] - view.target[nearest[on], 3:], axis=1)))
 
 
+def _nearness(model: Model, hands: FloatArray) -> FloatArray:
+    """Of an object to the places ``hands (E, 3)`` in the reference image: ``(E,)`` in [0, 1]."""
+    return np.exp(-((cKDTree(model.points).query(hands)[0] / HAND_REACH_M) ** 2))
+
+
 def _aligned(
     model: Model, views: Sequence[View], found: Sequence[Registration], hands: FloatArray | None
 ) -> tuple[list[Registration], Model]:
@@ -217,9 +225,7 @@ def _aligned(
     """
     stretch = len(views) >= MIN_IMAGES_OF_KIND
     points = model.points
-    near = np.zeros(0)
-    if hands is not None:
-        near = np.exp(-((cKDTree(points).query(hands[0])[0] / HAND_REACH_M) ** 2))
+    near = _nearness(model, hands[0]) if hands is not None else np.zeros(0)
     options, priors = [np.eye(4)[None]], [np.zeros(1)]
     poses = [np.eye(4)[None]]
     for number, (view, one) in enumerate(zip(views[1:], found[1:], strict=True), 1):
@@ -235,7 +241,7 @@ def _aligned(
             moved = hands[number] @ np.swapaxes(back[:, :3, :3], 1, 2) + back[:, None, :3, 3]
             squares = ((moved - hands[0]) ** 2).sum(axis=2) / (2 * HAND_SPREAD_M**2)
             prior = prior - np.minimum(squares, MAX_HAND_LOSS) @ near
-        kept = np.flatnonzero(prior > prior.max() - 2 * MAX_RIVAL_LOSS)
+        kept = np.union1d(0, np.flatnonzero(prior > prior.max() - 2 * MAX_RIVAL_LOSS))
         poses.append(rivals.motions[kept])
         options.append(_stretched(model, poses[-1], view) if stretch else poses[-1])
         priors.append(prior[kept])
@@ -374,16 +380,28 @@ def _split(
 
 
 def _complete(
-    models: Sequence[Model], found: Sequence[Sequence[Registration]], number: int, views: Sequence[View], seed: int
+    models: Sequence[Model],
+    found: Sequence[Sequence[Registration]],
+    number: int,
+    views: Sequence[View],
+    seed: int,
+    handled: bool,
 ) -> RigidObject:
-    """Object ``number`` with templates from all views, and registered with them; the best views come first."""
+    """Object ``number`` with templates from all views, and registered with them; the best views come first. One that is
+    ``handled`` stays where the hand tells.
+    """
     model, registrations = models[number], [row[number] for row in found]
     templates = list(model.templates)
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
         better = [k for k in range(len(models)) if found[i][k].score > found[i][number].score]
         taken = _explained(models, found[i], better)
-        grown = [*models[:number], replace(model, templates=tuple(templates)), *models[number + 1 :]]
-        registrations[i] = _register_model(grown, number, views[i], found[i], taken, registrations[i].pose[None])
+        start = registrations[i].pose[None]
+        if handled:
+            one = register(templates, views[i], taken, start, vote=False, colour_cap=model.colour_cap)
+            registrations[i] = one if one.fitness else registrations[i]
+        else:
+            grown = [*models[:number], replace(model, templates=tuple(templates)), *models[number + 1 :]]
+            registrations[i] = _register_model(grown, number, views[i], found[i], taken, start)
         others = _explained(models, found[i], [k for k in range(len(models)) if k != number])
         templates += _another_template(views[i], registrations[i], templates, others, seed)
     return RigidObject(replace(model, templates=tuple(templates)), tuple(registrations))
@@ -559,7 +577,7 @@ def register(
 
 
 def _alternatives(model: Model, found: Registration, view: View, others: FloatArray = NO_MOTIONS) -> Candidates:
-    """The pose that was ``found``, its rivals, ``others (S, 4, 4)``, and the first one turned and slid."""
+    """The pose that was ``found``, its rivals, ``others (S, 4, 4)``, and the first one turned."""
     similarity = _similarity(model.templates, view, _similarities(model.templates, view))
     motions = np.concatenate([found.pose[None], found.rivals, others])
     return find_rivals(motions, model.templates[found.template].xyzrgb, view.target, similarity, view.hides, model.colour_cap)
@@ -576,19 +594,30 @@ def _stretched(model: Model, poses: FloatArray, view: View) -> FloatArray:
     return np.array(motions)
 
 
+def _preferred(model: Model, poses: FloatArray, chance: FloatArray) -> int:
+    """Number of the one of ``poses (C, 4, 4)`` with the best ``chance (C,)``, or of the first, which ICP found, where
+    that puts the object at the same place.
+    """
+    places = model.points @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    elsewhere = np.linalg.norm(places - places[0], axis=2).mean(axis=1) > SAME_PLACE_M
+    best = int(chance.argmax())
+    return best if elsewhere[best] else 0
+
+
 def _decided(model: Model, found: Registration, view: View) -> Registration:
     """``found`` or the rival of it that what ``view`` shows around the object speaks for, with the chances of all."""
     if model.surroundings is None or not found.fitness:
         return found
     rivals = _alternatives(model, found, view)
     chance = (rivals.score - rivals.score.max()) / RIVAL_SCALE
-    kept = np.flatnonzero(chance > -MAX_RIVAL_LOSS)
+    kept = np.union1d(0, np.flatnonzero(chance > -MAX_RIVAL_LOSS))
     motions = _stretched(model, rivals.motions[kept], view) if model.surroundings.stretch else rivals.motions[kept]
     chance = chance[kept] + model.surroundings.evidence(view, motions) / EVIDENCE_SCALE
-    order = np.argsort(-chance, kind="stable")
-    shares = np.exp(chance[order] - chance.max())
-    pose, fitness, similarity = rivals.motions[kept[order[0]]], found.fitness, found.similarity
-    if kept[order[0]] != 0:
+    best = _preferred(model, rivals.motions[kept], chance)
+    order = np.array([best, *(k for k in range(len(kept)) if k != best)])
+    shares = np.exp(np.minimum(chance[order] - chance[best], 0))
+    pose, fitness, similarity = rivals.motions[kept[best]], found.fitness, found.similarity
+    if best:
         source = model.templates[found.template].xyzrgb
         measured = _similarity(model.templates, view, _similarities(model.templates, view))
         pose, fitness, similarity = polish(pose, source, view.target, measured, view.hides, model.colour_cap)
