@@ -19,7 +19,11 @@ from robust_instant_policy.evaluation.scenes import obtain_demonstrations, scene
 from robust_instant_policy.perception import KeypointExtractor, measure
 from robust_instant_policy.tasks import UNSEEN_TASKS, make_task
 
-SYMMETRIES = {"goal": 72, "cube": 4}  # parts of which the image does not show by which of these turns they are turned
+SYMMETRIES = {
+    "goal": 72,
+    "cube": 4,
+    "bowl": 72,
+}  # parts of which the image does not show by which of these turns they are turned
 DEMONSTRATIONS = 10
 RIGHT_M = 0.02  # greatest error of a keypoint that is right
 Row = dict[str, Any]

@@ -42,6 +42,7 @@ HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of 
 MAX_HAND_LOSS = 12.0
 ALIGNMENT_ROUNDS = 3
 EVIDENCE_SCALE = 8.0  # of the surroundings' evidence: neighbouring cells of the grid are not independent
+MIN_ADVANTAGE = 1.0  # of the logarithm of the chance, for a motion that replaces the one that ICP found
 MAX_RIVAL_LOSS = 6.0  # in units of RIVAL_SCALE, for a motion that the surroundings may speak for
 RIVAL_SCALE = 0.03  # of the score by which a motion is worse, for a weight of 1/e
 SAME_PLACE_M = 0.02
@@ -107,8 +108,8 @@ class Template:
 class Model:
     """What an object looks like: its ``templates``, the reference image's first; ``parent``: for a part that moves
     against the rest of an object, the number of that, otherwise -1; ``family``: templates of an object with all its
-    parts, which tell its turn where it alone is symmetric; whether it ``varies`` in size between images; its ``surroundings``,
-    unless it is a part; ``colour_cap``, see `icp`.
+    parts, which tell its turn where it alone is symmetric; whether it ``varies`` in size between images; its
+    ``surroundings``, where the hand's places are known and it is no part; ``colour_cap``, see `icp`.
     """
 
     templates: tuple[Template, ...]
@@ -153,9 +154,9 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
     models = [Model((_template_of(home, piece, seed),)) for piece in pieces]
     found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
     handled = set()
-    if len(views) > 1:
+    if hands is not None and len(views) > 1:
         for number, model in enumerate(models):
-            if hands is not None and _nearness(model, hands[0]).max() > MIN_NEAR:
+            if _nearness(model, hands[0]).max() > MIN_NEAR:
                 handled.add(number)
             aligned, models[number] = _aligned(model, views, [row[number] for row in found], hands)
             for row, registration in zip(found, aligned, strict=True):
@@ -189,14 +190,14 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
         for i, view in enumerate(views)
     ]
     return [
-        _with_surroundings(thing if not varies else _with_shapes(thing, [row[number] for row in shapes]), views)
+        _with_surroundings(_with_shapes(thing, [row[number] for row in shapes]) if varies else thing, views)
         for number, (thing, varies) in enumerate(zip(things, _vary(np.array(shapes)), strict=True))
     ]
 
 
 def _with_surroundings(thing: RigidObject, views: Sequence[View]) -> RigidObject:
     """``thing`` with what the ``views`` show around it."""
-    if thing.model.parent >= 0:
+    if thing.model.parent >= 0 or thing.model.surroundings is None:
         return replace(thing, model=replace(thing.model, surroundings=None))
     motions = [one.motion for one in thing.registrations]
     seen = Surroundings.of(thing.points, views, motions, thing.model.varies)
@@ -204,7 +205,7 @@ def _with_surroundings(thing: RigidObject, views: Sequence[View]) -> RigidObject
 
 
 def _colour_difference(xyzrgb: Float32Array, view: View, pose: FloatArray) -> float:
-    """Median distance in colour, metres as in `View.xyzrgb`, of points ``(N, 6)`` at ``pose`` from those they lie on."""
+    """Median distance in colour, as in `View.xyzrgb`, of points ``(N, 6)`` at ``pose`` from those that they lie on."""
     distance, nearest = cKDTree(view.target[:, :3]).query(transform_points(pose, xyzrgb[:, :3]))
     on = distance < CLAIM_M
     if not on.any():
@@ -218,29 +219,30 @@ def _nearness(model: Model, hands: FloatArray) -> FloatArray:
 
 
 def _aligned(
-    model: Model, views: Sequence[View], found: Sequence[Registration], hands: FloatArray | None
+    model: Model, views: Sequence[View], found: Sequence[Registration], hands: FloatArray
 ) -> tuple[list[Registration], Model]:
     """The registrations of an object in ``views``, of those ``found`` and their rivals, for which the surroundings of
     the object and the ``hands`` (see `find_objects`) in its frame agree best; and the object with its surroundings.
     """
     stretch = len(views) >= MIN_IMAGES_OF_KIND
     points = model.points
-    near = _nearness(model, hands[0]) if hands is not None else np.zeros(0)
+    near = _nearness(model, hands[0])
     options, priors = [np.eye(4)[None]], [np.zeros(1)]
     poses = [np.eye(4)[None]]
     for number, (view, one) in enumerate(zip(views[1:], found[1:], strict=True), 1):
         by_hand = NO_MOTIONS
-        if hands is not None and near.max() > MIN_NEAR:
+        if near.max() > MIN_NEAR:
             by_hand = fit_upright(hands[0], hands[number], near + 1e-9)[None]
             similarity = _similarity(model.templates, view, _similarities(model.templates, view))
-            by_hand = refine(by_hand, model.templates[0].xyzrgb, view.target, similarity, view.hides, model.colour_cap).motions
+            by_hand = refine(
+                by_hand, model.templates[0].xyzrgb, view.target, similarity, view.hides, model.colour_cap
+            ).motions
         rivals = _alternatives(model, one, view, by_hand)
         prior = (rivals.score - rivals.score.max()) / RIVAL_SCALE
-        if hands is not None:
-            back = np.linalg.inv(rivals.motions)
-            moved = hands[number] @ np.swapaxes(back[:, :3, :3], 1, 2) + back[:, None, :3, 3]
-            squares = ((moved - hands[0]) ** 2).sum(axis=2) / (2 * HAND_SPREAD_M**2)
-            prior = prior - np.minimum(squares, MAX_HAND_LOSS) @ near
+        back = np.linalg.inv(rivals.motions)
+        moved = hands[number] @ np.swapaxes(back[:, :3, :3], 1, 2) + back[:, None, :3, 3]
+        squares = ((moved - hands[0]) ** 2).sum(axis=2) / (2 * HAND_SPREAD_M**2)
+        prior = prior - np.minimum(squares, MAX_HAND_LOSS) @ near
         kept = np.union1d(0, np.flatnonzero(prior > prior.max() - 2 * MAX_RIVAL_LOSS))
         poses.append(rivals.motions[kept])
         options.append(_stretched(model, poses[-1], view) if stretch else poses[-1])
@@ -422,14 +424,16 @@ def _register_model(
         # In one image parts hide some of their object, in all of them nothing.
         whole = np.concatenate([template.surface for template in models[model.parent].templates])
         beside = transform_points(parent.motion, whole)
-        return register(model.templates, view, taken, starts, parent=parent.pose, beside=beside, colour_cap=model.colour_cap)
-    found = register(model.templates, view, taken, starts, colour_cap=model.colour_cap)
+        return register(
+            model.templates, view, taken, starts, parent=parent.pose, beside=beside, colour_cap=model.colour_cap
+        )
+    alone = register(model.templates, view, taken, starts, colour_cap=model.colour_cap)
     if model.family:
         family = register(model.family, view, taken, colour_cap=model.colour_cap)
         in_family = register(model.templates, view, taken, family.pose[None], vote=False, colour_cap=model.colour_cap)
-        if in_family.score + MUCH_BETTER > found.score:
-            found = in_family
-    return _decided(model, found, view)
+        if alone.score <= in_family.score + MUCH_BETTER:
+            alone = in_family
+    return _decided(model, alone, view)
 
 
 def register_all(models: Sequence[Model], view: View) -> list[Registration]:
@@ -580,7 +584,9 @@ def _alternatives(model: Model, found: Registration, view: View, others: FloatAr
     """The pose that was ``found``, its rivals, ``others (S, 4, 4)``, and the first one turned."""
     similarity = _similarity(model.templates, view, _similarities(model.templates, view))
     motions = np.concatenate([found.pose[None], found.rivals, others])
-    return find_rivals(motions, model.templates[found.template].xyzrgb, view.target, similarity, view.hides, model.colour_cap)
+    return find_rivals(
+        motions, model.templates[found.template].xyzrgb, view.target, similarity, view.hides, model.colour_cap
+    )
 
 
 def _stretched(model: Model, poses: FloatArray, view: View) -> FloatArray:
@@ -601,7 +607,7 @@ def _preferred(model: Model, poses: FloatArray, chance: FloatArray) -> int:
     places = model.points @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
     elsewhere = np.linalg.norm(places - places[0], axis=2).mean(axis=1) > SAME_PLACE_M
     best = int(chance.argmax())
-    return best if elsewhere[best] else 0
+    return best if elsewhere[best] and chance[best] > chance[~elsewhere].max() + MIN_ADVANTAGE else 0
 
 
 def _decided(model: Model, found: Registration, view: View) -> Registration:

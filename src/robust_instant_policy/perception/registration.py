@@ -261,7 +261,12 @@ def rotated(motion: FloatArray, centre: FloatArray, angles: FloatArray) -> Float
 
 
 def icp(
-    motions: FloatArray, source: Float32Array, target: Float32Array, reaches: tuple[float, ...], hidden: Hidden, cap: float
+    motions: FloatArray,
+    source: Float32Array,
+    target: Float32Array,
+    reaches: tuple[float, ...],
+    hidden: Hidden,
+    cap: float,
 ) -> tuple[FloatArray, FloatArray]:
     """``motions (C, 4, 4)`` after one ICP iteration for each of ``reaches`` (kernel widths, metres), and their fitness.
 

@@ -1,4 +1,4 @@
-"""What all images show in and around an object: it tells the object's turn where its own points look the same after some.
+"""What all images show in and around an object: it tells its turn where its own points look the same after some.
 
 A horizontal grid in the object's frame. For each cell the images tell the chance that something stands there: a handle,
 a door or a lever of few points decides, where a mean over all of the object's points would not.
@@ -25,8 +25,8 @@ LEAST_CHANCE = 0.12  # that a cell is not as in all images before
 @dataclass(frozen=True, eq=False)
 class Surroundings:
     """``evidence_of (3, n)``: for each of n ``cells (n, 2)``, horizontal places in the reference image's world, metres,
-    the logarithm of the chance of its state in an image (see `view.Ground`) against that of a coin; ``stretch``: whether
-    the motions in the images include changes of size.
+    the logarithm of the chance of its state in an image (see `view.Ground`) against that of a coin; whether the motions
+    in the images include changes of size, ``stretch``.
     """
 
     cells: FloatArray
@@ -43,7 +43,10 @@ class Surroundings:
         return cls.from_states(cells, shape, states, stretch)
 
     @classmethod
-    def from_states(cls, cells, shape, states, stretch):
+    def from_states(
+        cls, cells: FloatArray, shape: tuple[int, int], states: NDArray[np.int8], stretch: bool
+    ) -> Surroundings:
+        """From the ``states (I, n)`` of ``cells (n, 2)`` of a grid of ``shape`` in I images."""
         occupied, free = (states == OCCUPIED).sum(axis=0), (states == FREE).sum(axis=0)
         chance = ((occupied + 0.5) / (occupied + free + 1)).reshape(shape)
         chance = gaussian_filter(chance, BLUR_CELLS).clip(LEAST_CHANCE, 1 - LEAST_CHANCE).reshape(-1)
