@@ -45,6 +45,15 @@ def workbench(tmp_path_factory, worker_id) -> Path:
 
 
 @pytest.fixture(scope="session")
+def reach(tmp_path_factory) -> Path:
+    """A folder with ``data/metaworld-reach``, of the task that a new process starts soonest."""
+    folder = tmp_path_factory.mktemp("reach")
+    out = folder / "data" / "metaworld-reach"
+    assert main(["record", "--task", "metaworld/reach", "--episodes", "4", "--out", str(out)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
 def lerobot_files(tmp_path_factory) -> Path:
     """Datasets that lerobot 0.6.1 wrote or edited (`files/make_lerobot_files.py`)."""
     folder = tmp_path_factory.mktemp("lerobot")
