@@ -20,7 +20,7 @@ from tests.robots_cells import after, reach, write_cell
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no release for Python 3.13")
 
-from robust_instant_policy.robots.followers.ur import GRIPPER_PORT, RobotiqGripper
+from robust_instant_policy.robots.rtde import GRIPPER_PORT, RobotiqGripper
 
 POINTS = ((0.0, 0.0, 0.05), (0.0, 0.0, 0.01), (0.0, 0.0, 0.05))
 
