@@ -58,10 +58,11 @@ class Section:
             raise self.error(key, f"must be a number from {least:g} to {most:g}, not {value!r}")
         return float(value)
 
-    def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
+    def whole(self, key: str, default: int | None = None, least: int = 0, most: float = math.inf) -> int:
         value = self._take(key, default)
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise self.error(key, f"must be a whole number of at least {least}, not {value!r}")
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            words = f"of at least {least}" if math.isinf(most) else f"from {least} to {most:g}"
+            raise self.error(key, f"must be a whole number {words}, not {value!r}")
         return value
 
     def flag(self, key: str, default: bool | None = None) -> bool:
