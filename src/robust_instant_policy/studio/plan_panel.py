@@ -91,7 +91,7 @@ class PlanPanel:
         return self._plan.trajectory
 
     def compared(self) -> dict[str, Trajectory]:
-        """The trajectory of each method of `planner.COMPARED` from the present candidates."""
+        """The trajectory of each method of `Draft.compared` from the present candidates."""
         if self._draft is None:
             raise UsageError("there is no plan; press Plan first")
         return {method: plan.trajectory for method, plan in self._draft.compared(self._choices()).items()}
