@@ -7,8 +7,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robust_instant_policy.errors import RipError, RobotError
+from robust_instant_policy.errors import RipError, RobotError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.guard import check_home
 from robust_instant_policy.robots.calibration import check_camera
 from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cameras import make_camera
@@ -39,6 +40,10 @@ def check_cell(config: CellConfig, say: Callable[[str], object]) -> int:
 def _arms(config: CellConfig) -> list[tuple[str, bool]]:
     lines = []
     with Station(config) as station:
+        try:
+            check_home(station.arms, config.limits, config.rate_hz)
+        except UnreachableError as error:
+            lines.append((str(error), False))
         for arm, follower in zip(station.arms, station.followers, strict=True):
             seconds, clocks = [], []
             for _ in range(READINGS):
