@@ -113,7 +113,7 @@ def cut_vocabulary(source: Path, target: Path, keep: Callable[[str, int], bool])
     except ModuleNotFoundError:
         raise MissingExtraError("gguf", "embedded") from None
 
-    class PlainReader(GGUFReader):  # type: ignore[misc]
+    class PlainReader(GGUFReader):
         """Slices of a plain array take a fraction of the time of those of a memory map."""
 
         def __setattr__(self, name: str, value: object) -> None:
