@@ -150,10 +150,11 @@ def make_view(
 ) -> View:
     """Describe and segment an image.
 
-    A point is foreground by its height above the table, or, when flat, by the network's saliency and a colour that
-    differs from the table's, or where it lies in a hole of the table. What is else below or beside the table, outside ``workspace (2, 3)`` (metres, world; its lower
-    z is ignored), or reaches in over the border is not, nor is a piece that holds a part of ``hands``. Raises
-    `KeypointError` for intrinsics of another resolution, and for too few depth readings or foreground points.
+    A point is foreground by its height above the table, in a hole of the table, or, when flat, by the network's
+    saliency and a colour that differs from the table's. What is under or beside the table, outside ``workspace (2, 3)``
+    (metres, world; its lower z is ignored), or reaches in over the border is not, nor is a piece that holds a part of
+    ``hands``. Raises `KeypointError` for intrinsics of another resolution, and for too few depth readings
+    or foreground points.
     """
     _check_resolution(observation)
     depth, note = in_metres(observation.depth)
