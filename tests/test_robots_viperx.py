@@ -185,8 +185,12 @@ def test_a_servo_that_is_missing_is_named(own):
 
 def test_robot_check_says_what_is_well_and_what_is_not(tmp_path, capsys):
     path = write_cell(tmp_path, "left")
+    leader = 'leader = { kind = "gello", port = "/dev/nowhere", calibration = "leader.toml" }'
+    path.write_text(path.read_text().replace("driver", f"{leader}\ndriver"))
     assert main(["robot", "check", "--robot", str(path)]) == 1
     said = capsys.readouterr().out
+    assert re.search(r"ok    left: its clock advances by \d+\.\d\d s a second", said)
+    assert "WRONG the leader of left is not calibrated" in said
     assert "left: 95% of the states within" in said  # how fast depends on the machine
     assert "ok    left: at its park pose" in said
     assert "WRONG this emulated cell has no scene and no camera" in said

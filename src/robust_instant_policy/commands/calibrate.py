@@ -107,7 +107,8 @@ def _camera(options: argparse.Namespace) -> None:
             raise CellError(f'{options.robot}: give the table [camera] calibration = "camera.toml", the file to write')
         board = _the_board(options)
         camera = make_camera(cell.config.camera, cell.config.path.parent)
-        camera.connect()
+        with cell.terminal.stop.ends_waiting():
+            camera.connect()
         try:
             result = _calibrated(options, cell, camera, board)
         finally:

@@ -44,6 +44,7 @@ MOST_SHARE = 0.2  # of the camera's time for them
 JPEG_QUALITY = 80
 NICE = 5  # the process that commands the arms goes first
 STARTING_S, READING_S = 60.0, 40.0
+ENDING_S = 1.0  # of a camera that hangs
 SIGNALS = (signal.SIGINT, signal.SIGHUP)
 
 
@@ -91,8 +92,9 @@ class LiveCamera:
 
     def disconnect(self) -> None:
         self._wire.close()  # it ends then
-        self._process.join(5.0)
-        self._process.kill()
+        if self._process.pid is not None:
+            self._process.join(ENDING_S)
+            self._process.kill()
 
     def _send(self, what: str, value: object) -> None:
         """A failure is told by `_answer`: what is only shown on the page must not stop an arm."""

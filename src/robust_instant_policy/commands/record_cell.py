@@ -39,7 +39,8 @@ def record_cell(options: argparse.Namespace) -> int:
             screen.say(line)
             camera.say(line)
 
-        terminal = stack.enter_context(Terminal(stack.enter_context(stop_on_signals()), say))
+        stop = stack.enter_context(stop_on_signals())
+        terminal = stack.enter_context(Terminal(stop, say))
         station = Station(config)
         leaders = [
             make_leader(one, arm, config.rate_hz, folder, terminal.pressed)
@@ -54,8 +55,9 @@ def record_cell(options: argparse.Namespace) -> int:
         for leader in leaders:
             leader.connect()
             stack.callback(leader.disconnect)
-        camera.connect()
         stack.callback(camera.disconnect)
+        with stop.ends_waiting():
+            camera.connect()
         screen.say(f"live picture and keypoints: {camera.url}")
         Session(station, leaders, camera, writer, terminal, camera.show, next_scene).record(options.episodes)
     screen.say(f"{options.out}: {writer.num_episodes} demonstrations of {options.task}, {writer.discarded} discarded")

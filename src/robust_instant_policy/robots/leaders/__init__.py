@@ -66,8 +66,11 @@ def joint_source(config: ArmConfig) -> JointSource:
 
         usual = servos.ALOHA_SERVOS if kind == "aloha" else servos.GELLO_SERVOS
         baud = section.whole("baud", 1_000_000 if kind == "aloha" else 57_600, least=1)
-        numbers = section.array("servos", (None,), usual).astype(int).tolist()
-        timeout_ms = section.number("timeout_ms", servos.TIMEOUT_MS, 1.0, 1e4)
+        wanted = section.array("servos", (None,), usual)
+        numbers = wanted.astype(int).tolist()
+        if (wanted != numbers).any() or len(set(numbers)) < len(numbers) or not 0 <= min(numbers) <= max(numbers) < 253:
+            raise section.error("servos", "must be different whole numbers from 0 to 252, the IDs of the servos")
+        timeout_ms = section.number("timeout_ms", servos.TIMEOUT_MS, 1.0, 1e3)
         source = servos.DynamixelSource(name, section.text("port"), baud, numbers, timeout_ms)
     section.finish()
     return source
