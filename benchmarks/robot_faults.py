@@ -49,6 +49,7 @@ CELLS = {
 ARMS = {"viperx": "ViperX 300", "ur5e": "UR5e"}
 WATCHED = ("unplugged", "silent", "overload", "frozen", "nan", "protective-stop")  # of devices that no longer answer
 WATCHDOG_CASES = 4  # of each
+STOPPING_S = 0.1  # in which an arm must stop once the process that commands it has ended
 STILL_S = 0.5  # after a stop, in which nothing may be executed any more
 HOLD_COMMANDS = 2  # that a stop itself may execute, at the present position
 SPEED_TOLERANCE = 1.1  # of executed speeds: servos count whole units, the last step of a stop included
@@ -194,6 +195,7 @@ def ended_by(number: signal.Signals) -> Callable[[Case], Outcome]:
         process.start()
         with _at(emulation, begun + int(case.rng.integers(10, 100)), lambda: os.kill(process.pid, number)):
             process.join()
+        time.sleep(STOPPING_S)
         kept = number == signal.SIGKILL or (case.folder / "measured.npz").exists()
         return _outcome(f"ended by {number.name}", kept, emulation, begun)
 

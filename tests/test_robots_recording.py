@@ -228,11 +228,11 @@ def test_the_page_shows_the_live_picture_and_the_keypoints_of_the_start_image(ce
     camera = LiveCamera(cell.config.camera, tmp_path, tmp_path / "demos", cell.config.limits.workspace)
     camera.connect()
     try:
-        camera.say("hold the leader <here>")
         frame = camera.read()
         camera.show(Observation(frame.rgb, frame.depth, frame.intrinsics, np.eye(4)))
+        camera.say("hold the leader <here>")
         within(20, lambda: b"once there is a demonstration" in get("/start"))
-        assert json.loads(get("/state"))["line"] == "hold the leader <here>"
+        within(20, lambda: json.loads(get("/state"))["line"] == "hold the leader <here>")
         shown = np.asarray(Image.open(io.BytesIO(get("/live.jpg"))), dtype=float)
         grey = (image @ [0.299, 0.587, 0.114] for image in (shown, frame.rgb))  # JPEG keeps fewer colours
         assert np.corrcoef(*map(np.ravel, grey))[0, 1] > 0.9
