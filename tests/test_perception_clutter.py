@@ -8,6 +8,7 @@ import pytest
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import make_pose, project
 from robust_instant_policy.perception import KeypointExtractor
+from robust_instant_policy.perception.view import make_view
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.trajectory import Trajectory
 
@@ -130,6 +131,9 @@ def test_a_gripper_in_the_image_gets_no_keypoints_and_is_told():
     paths = [path_to(*blocks[0][:2], start=(0.24, 0.0, 0.15)) for blocks in scenes]
     extractor = KeypointExtractor(features="efficientnet").fit(images[:4], paths[:4])
     assert set(owners(extractor.pixels_[0], images[0], scenes[0])) == {0}
+    view = make_view(images[0], extractor.network_)
+    on_it, under_it, beside_the_image = (0.24, 0.0, 0.25), (0.3, 0.0, 0.0), (0.5, 0.0, -0.1)
+    assert view.hides(np.array([on_it, under_it, beside_the_image])).tolist() == [False, True, False]
     located = extractor.locate(images[4])
     assert set(owners(located.pixels, images[4], scenes[4])) == {0}
     assert any("arm is in the image" in note for note in located.notes)

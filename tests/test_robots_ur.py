@@ -68,7 +68,7 @@ def end_library():
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("protective-stop", r"protective stop|no longer takes targets"),
+        ("protective-stop", "protective stop; see the teach pendant for the reason"),
         ("frozen", r"frozen|away from its command"),
         ("silent", "does not answer"),
         ("nan", "not numbers"),

@@ -51,12 +51,12 @@ def record_cell(options: argparse.Namespace) -> int:
         next_scene = (
             None if emulation is None else partial(_next_scene, emulation, count(0 if last is None else last + 1))
         )
-        stack.enter_context(station)
-        for leader in leaders:
-            leader.connect()
-            stack.callback(leader.disconnect)
-        stack.callback(camera.disconnect)
         with stop.ends_waiting():
+            stack.enter_context(station)
+            for leader in leaders:
+                leader.connect()
+                stack.callback(leader.disconnect)
+            stack.callback(camera.disconnect)
             camera.connect()
         screen.say(f"live picture and keypoints: {camera.url}")
         Session(station, leaders, camera, writer, terminal, camera.show, next_scene).record(options.episodes)

@@ -106,13 +106,14 @@ class View:
     notes: tuple[str, ...]
 
     def hides(self, points: FloatArray) -> NDArray[np.bool_]:
-        """Which of ``points (..., 3)``, metres, world, lie behind a surface that the image shows."""
+        """Which of ``points (..., 3)``, metres, world, lie in the image, behind a surface that it shows."""
         camera = self.observation
         pixels = np.rint(project(points, camera.intrinsics, camera.camera_pose))
         height, width = self.depth.shape
         u, v = (pixels[..., axis].clip(0, size - 1).astype(np.intp) for axis, size in enumerate((width, height)))
+        inside = (pixels[..., 0] == u) & (pixels[..., 1] == v)
         axis = camera.camera_pose[:3, 2]
-        return (points - camera.camera_pose[:3, 3]) @ axis - self.depth[v, u] > HIDDEN_M
+        return inside & ((points - camera.camera_pose[:3, 3]) @ axis - self.depth[v, u] > HIDDEN_M)
 
     @property
     def shows_hand(self) -> bool:

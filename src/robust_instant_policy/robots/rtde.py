@@ -31,6 +31,7 @@ RECEIVE_HZ = 125.0
 WATCHDOG_HZ = 10.0  # the controller stops the script when targets arrive more rarely
 LOOKAHEAD_S, GAIN = 0.1, 300.0  # of servoJ, the maker's defaults
 STOP_DECELERATION = 2.0  # rad/s², of stopJ
+REASON_S = 0.03  # after which a state tells why a target was not taken
 SCRIPT_S = 5.0  # for the script to start
 END_S = 2.0  # that the library may take to stop and disconnect when the process ends
 GRIPPER_PORT = 63352
@@ -104,6 +105,7 @@ class Controller:
 
     def command(self, joints: list[float], finger_travel: float) -> None:
         if not self._control.servoJ(joints, 0.0, 0.0, self._step, LOOKAHEAD_S, GAIN):
+            time.sleep(REASON_S)
             faults = "; ".join(_faults(self._receive.getSafetyStatusBits()))
             raise RobotError(
                 f"{self._name}: the controller no longer takes targets: {faults or 'see the teach pendant'}"

@@ -37,15 +37,16 @@ def make(arm: Arm, section: Section, rate_hz: float) -> LeRobotFollower:
     count = len(arm.home)
     if len(keys) != count:
         raise section.error("keys", f"must name {count} joints, as many as park has angles")
+    gripper = section.text("gripper", "gripper.pos")
+    if len({*keys, gripper}) <= count:
+        raise section.error("keys", "must name each joint once, and not the gripper")
     device = load_factory(section.text("factory"), f"driver of {arm.name}")()
     signs, offsets = (
         section.array(key, (count,), [value] * count) for key, value in (("signs", 1.0), ("offsets", 0.0))
     )
     if not np.isin(signs, (-1.0, 1.0)).all():
         raise section.error("signs", "must be 1 or -1 for each joint")
-    return LeRobotFollower(
-        arm.name, device, keys, section.text("gripper", "gripper.pos"), signs, offsets, arm.finger_travel
-    )
+    return LeRobotFollower(arm.name, device, keys, gripper, signs, offsets, arm.finger_travel)
 
 
 class LeRobotFollower:
