@@ -49,7 +49,7 @@ def errors(prompt: Prompt, draw, count: int = 6) -> np.ndarray:
         ("along", "of any size"),
         ("lid", "hinged to"),
         ("place", "axes of keypoints"),
-        ("middle", " and 34% to keypoints 4-6"),
+        ("middle", " and 34% of the way to keypoints 4-6"),
         ("row", "x 101%, y 0%"),
     ],
 )

@@ -70,8 +70,7 @@ class StepFrames:
         for arm, own in enumerate(self.arms):
             changes = [step for step in range(1, len(own)) if not own[step].continues(own[step - 1])]
             for start, stop in pairwise([0, *changes, len(own)]):
-                first, last = own[start], own[stop - 1]
-                words = str(last) if first.way == last.way else f"{first.way} to {last}"
+                words = own[stop - 1].words_from(own[start])
                 found.append((words, arm, start, stop - 1, poses[stop - 1, arm]))
         return found
 
