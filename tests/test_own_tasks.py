@@ -134,6 +134,14 @@ class Millimetres(PlaceBlock):
         return type(seen)(seen.rgb, 1000 * seen.depth, seen.intrinsics, seen.camera_pose)
 
 
+class Sky(PlaceBlock):
+    def reset(self, seed):
+        seen = super().reset(seed)
+        depth = seen.depth.copy()
+        depth[0] = 83.1
+        return type(seen)(seen.rgb, depth, seen.intrinsics, seen.camera_pose)
+
+
 class Random(PlaceBlock):
     count = 0
 
@@ -188,6 +196,7 @@ class ImageOnly(PlaceBlock):
     [
         (WrongCamera, "check camera_pose"),
         (Millimetres, "check camera_pose and units"),
+        (Sky, "it cannot be recorded: depth has values up to 83.1 m"),
         (Random, "draw everything from the seed"),
         (OneScene, "look the same"),
         (GoesOn, "start from the scene as reset drew it"),
