@@ -49,6 +49,7 @@ CELLS = {
 ARMS = {"viperx": "ViperX 300", "ur5e": "UR5e"}
 WATCHED = ("unplugged", "silent", "overload", "frozen", "nan", "protective-stop")  # of devices that no longer answer
 WATCHDOG_CASES = 4  # of each
+STOPPING_S = 0.1  # in which an arm must stop once the process that commands it has ended
 STILL_S = 0.5  # after a stop, in which nothing may be executed any more
 HOLD_COMMANDS = 2  # that a stop itself may execute, at the present position
 SPEED_TOLERANCE = 1.1  # of executed speeds: servos count whole units, the last step of a stop included
@@ -194,6 +195,7 @@ def ended_by(number: signal.Signals) -> Callable[[Case], Outcome]:
         process.start()
         with _at(emulation, begun + int(case.rng.integers(10, 100)), lambda: os.kill(process.pid, number)):
             process.join()
+        time.sleep(STOPPING_S)
         kept = number == signal.SIGKILL or (case.folder / "measured.npz").exists()
         return _outcome(f"ended by {number.name}", kept, emulation, begun)
 
@@ -291,7 +293,8 @@ KINDS = (
         ("protective-stop", 14), ("unplugged", 12), ("silent", 8), ("frozen", 8), ("nan", 8),
     )),
     Kind("clock jump", "viperx", 10, clock_jump),
-    Kind("process killed", "viperx", 8, ended_by(signal.SIGKILL)),
+    Kind("process killed", "viperx", 4, ended_by(signal.SIGKILL)),
+    Kind("commanding process killed", "ur5e", 4, ended_by(signal.SIGKILL)),
     Kind("terminal closed", "viperx", 6, ended_by(signal.SIGHUP)),
     Kind("full disk", "viperx", 6, full_disk),
     Kind("camera frozen", "viperx", 4, camera_fault("frozen")),

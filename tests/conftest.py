@@ -4,6 +4,7 @@ import shutil
 import signal
 import tarfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,10 @@ from robust_instant_policy.cli import main
 
 NUM_DEMONSTRATIONS = 5
 # These files take the most time. They come first, so that all workers end at about the same time.
-LONGEST = ("evaluation_workers", "diffusion", "demo", "tasks_aloha", "llm_embedded", "docs")
+LONGEST = (
+    "tasks_aloha", "evaluation_workers", "robots_run", "diffusion", "tasks_five", "studio", "llm_embedded", "demo",
+    "docs", "tasks_metaworld", "tasks_assets", "policies", "sanity", "fuzz", "cli", "tasks_push_cube", "own_tasks",
+)  # fmt: skip
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -42,6 +46,28 @@ def workbench(tmp_path_factory, worker_id) -> Path:
             _record(shared.with_suffix(".part"))
             shared.with_suffix(".part").rename(shared)
     return Path(shutil.copytree(shared, base / "workbench"))
+
+
+@pytest.fixture(scope="session")
+def reach(tmp_path_factory) -> Path:
+    """A folder with ``data/metaworld-reach``, of the task that a new process starts soonest."""
+    folder = tmp_path_factory.mktemp("reach")
+    out = folder / "data" / "metaworld-reach"
+    assert main(["record", "--task", "metaworld/reach", "--episodes", "4", "--out", str(out)]) == 0
+    return folder
+
+
+@pytest.fixture
+def in_this_process(monkeypatch) -> None:
+    """``rip eval`` works here, not in a process of its own, which takes seconds to start."""
+    from robust_instant_policy.evaluation.workbench import Workbench
+
+    def work_here(setup, works):
+        with closing(Workbench(setup)) as bench:
+            for work in works:
+                yield from bench.run(work)
+
+    monkeypatch.setattr("robust_instant_policy.commands.eval.LocalWorkers", lambda count: work_here)
 
 
 @pytest.fixture(scope="session")

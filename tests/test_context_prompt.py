@@ -10,6 +10,7 @@ import pytest
 from robust_instant_policy.context import Prompt, SequencePrompt, write_prompt
 from robust_instant_policy.context.alignment import align
 from robust_instant_policy.context.frames import Anchor, Axes, Frame
+from robust_instant_policy.context.step_frames import StepFrames
 from robust_instant_policy.context.things import WORLD, find_things, locate, robust_fit
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import GripperTriangle, make_pose
@@ -136,8 +137,9 @@ def test_a_place_between_two_objects_is_followed():
     keypoints, trajectories = demonstrations()
     prompt = write_prompt(keypoints, [half_way(*pair) for pair in zip(keypoints, trajectories, strict=True)])
     frame = prompt.frames.arms[0][-1]
-    assert str(frame).startswith(f"{frame.way} of the way from keypoints 0-4 to keypoints 5-9, axes of keypoints 5-9")
-    assert frame.shares[0] == pytest.approx(0.5, abs=0.03)
+    share = frame.shares[0][0]
+    assert str(frame) == f"{share:.0%} of the way from keypoints 0-4 to keypoints 5-9, axes of keypoints 5-9"
+    assert share == pytest.approx(0.5, abs=0.03)
     for seed in range(100, 110):
         new, truth = scene(seed)
         planned = prompt.median_trajectory(new)
@@ -166,7 +168,7 @@ def test_free_motion_is_written_in_interpolated_frames_and_does_not_jump():
     assert np.linalg.norm(planned.triplets - trajectories[7].triplets, axis=-1).max() < 0.015
 
 
-def test_axes_along_a_line_turn_with_it_seen_from_above_and_in_space():
+def test_axes_along_a_line_turn_with_it_and_frames_say_how_far_their_origin_moves():
     keypoints, _ = demonstrations(3)
     first, second = (thing for thing in find_things(keypoints) if thing.kind == "upright")
     ends = tuple(Anchor(thing, np.array([0.01, 0.02, 0.0])) for thing in (first, second))
@@ -179,6 +181,15 @@ def test_axes_along_a_line_turn_with_it_seen_from_above_and_in_space():
         assert np.allclose(pose[:3, 0], expected / np.linalg.norm(expected))
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
         assert np.allclose(pose[:3, 3], 0.75 * scene[first].position[0] + 0.25 * scene[second].position[0])
+    origin = (first, second, WORLD), (np.zeros(3),) * 3
+    low, high = (np.full(3, 0.1), np.full(3, 0.3)), (np.array([0.3, 0.3, 0.2]), np.full(3, 0.2))
+    steps = tuple(Frame(frame.axes, *origin, shares) for shares in (low, low, high))
+    ((words, arm, start, stop, _),) = StepFrames((steps,)).uses(keypoints[0])
+    assert words == (
+        "x 10% to 30%, y 10% to 30%, z 10% to 20% of the way from keypoints 0-4 to keypoints 5-9 "
+        "and 30% to 20% of the way to the world, axes along the line from keypoints 0-4 to keypoints 5-9 in space"
+    )
+    assert (arm, start, stop) == (0, 0, 2)
 
 
 def test_the_expected_curvature_is_that_of_the_demonstrations_whatever_their_number():

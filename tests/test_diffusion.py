@@ -15,8 +15,8 @@ from robust_instant_policy.errors import DatasetError, ModelError, UsageError
 from robust_instant_policy.evaluation import Episode, Scene, Setup, Variant, scene_seed
 from robust_instant_policy.evaluation.work import SceneWork
 from robust_instant_policy.evaluation.workbench import Workbench
-from robust_instant_policy.policies import Settings, make_policy
-from robust_instant_policy.policies.diffusion import ImageDiffusion, KeypointDiffusion, dp, training, vision
+from robust_instant_policy.policies import Settings, build_context, make_policy
+from robust_instant_policy.policies.diffusion import ImageDiffusion, KeypointDiffusion, dp, kat_dp, training, vision
 from robust_instant_policy.policies.diffusion.denoiser import Denoiser
 from robust_instant_policy.policies.diffusion.scaling import Scaling
 from robust_instant_policy.policies.diffusion.unet import ConditionalUnet1D
@@ -41,6 +41,18 @@ THREE = Settings(features="efficientnet", num_queries=3)
 @pytest.fixture(scope="module")
 def demonstrations(workbench):
     return load_demonstrations(workbench / "data" / "push-cube")
+
+
+@pytest.fixture(scope="module")
+def context(demonstrations):
+    """What keypoint policies know of the demonstrations, made once."""
+    return build_context(demonstrations, THREE)
+
+
+@pytest.fixture
+def small_batches(monkeypatch):
+    """Few enough trajectories a step to train while one waits."""
+    monkeypatch.setattr(kat_dp, "BATCH_SIZE", 4)
 
 
 @pytest.fixture(scope="module")
@@ -117,8 +129,8 @@ def test_samples_stay_within_limits_and_the_same_seed_gives_the_same(demonstrati
     np.testing.assert_allclose(scaling.restored(scaling.scaled(actions)), actions, atol=1e-12)
 
 
-def test_keypoint_diffusion_learns_recorded_demonstrations(demonstrations, workbench, tmp_path):
-    policy = KeypointDiffusion(THREE, Training(tmp_path, steps=80)).fit(demonstrations)
+def test_keypoint_diffusion_learns_recorded_demonstrations(demonstrations, context, workbench, tmp_path, small_batches):
+    policy = KeypointDiffusion(THREE, Training(tmp_path, steps=80)).fit_context(context)
     losses = policy.trained_.losses
     assert losses[-10:].mean() < 0.3 * losses[:10].mean()
     plan = policy.plan(Observation.load(workbench / "observation.npz"))
@@ -132,51 +144,54 @@ def test_keypoint_diffusion_learns_recorded_demonstrations(demonstrations, workb
     assert (plan.trajectory.actions[:, :9] < highest.max(axis=0) + 0.1).all()
 
 
-def test_a_training_that_was_killed_ends_as_if_it_had_not_been(demonstrations, tmp_path, monkeypatch):
+def test_a_training_that_was_killed_ends_as_if_it_had_not_been(context, tmp_path, monkeypatch, small_batches):
     monkeypatch.setattr(training, "SAVE_EVERY_S", 0.0)
-    whole = KeypointDiffusion(ONE, Training(tmp_path / "whole", steps=14)).fit(demonstrations)
+    whole = KeypointDiffusion(ONE, Training(tmp_path / "whole", steps=8)).fit_context(context)
     with pytest.raises(Killed):
-        KeypointDiffusion(ONE, Training(tmp_path / "cut", steps=14, report=killed_at(8))).fit(demonstrations)
+        KeypointDiffusion(ONE, Training(tmp_path / "cut", steps=8, report=killed_at(5))).fit_context(context)
     assert [path.name for path in (tmp_path / "cut").iterdir()] == [
         f"{whole.trained_.path.stem}.unfinished.safetensors"
     ]
-    resumed = KeypointDiffusion(ONE, Training(tmp_path / "cut", steps=14)).fit(demonstrations)
+    resumed = KeypointDiffusion(ONE, Training(tmp_path / "cut", steps=8)).fit_context(context)
     assert [path.name for path in (tmp_path / "cut").iterdir()] == [whole.trained_.path.name]
     one, other = load_file(whole.trained_.path), load_file(resumed.trained_.path)
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_what_was_trained_is_not_trained_again_and_other_demonstrations_are(demonstrations, tmp_path):
-    first = KeypointDiffusion(ONE, Training(tmp_path, steps=5)).fit(demonstrations)
-    KeypointDiffusion(ONE, Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
-    fewer = KeypointDiffusion(ONE, Training(tmp_path, steps=5))
+def test_what_was_trained_is_not_trained_again_and_other_demonstrations_are(
+    demonstrations, context, tmp_path, small_batches
+):
+    first = KeypointDiffusion(ONE, Training(tmp_path, steps=2)).fit_context(context)
+    KeypointDiffusion(ONE, Training(tmp_path, steps=2, report=refused)).fit_context(context)
+    fewer = KeypointDiffusion(ONE, Training(tmp_path, steps=2))
     assert fewer.fit(demonstrations[:4]).trained_.path != first.trained_.path
-    longer = KeypointDiffusion(ONE, Training(tmp_path, steps=6)).fit(demonstrations)
+    longer = KeypointDiffusion(ONE, Training(tmp_path, steps=3)).fit_context(context)
     assert longer.trained_.path != first.trained_.path
 
 
-def test_a_damaged_checkpoint_is_refused_in_one_line(demonstrations, tmp_path):
-    policy = KeypointDiffusion(ONE, Training(tmp_path, steps=5)).fit(demonstrations)
+def test_a_damaged_checkpoint_is_refused_in_one_line(context, tmp_path, small_batches):
+    policy = KeypointDiffusion(ONE, Training(tmp_path, steps=1)).fit_context(context)
     policy.trained_.path.write_bytes(b"half a file")
     with pytest.raises(ModelError, match="remove it to train again"):
-        policy.fit(demonstrations)
+        policy.fit_context(context)
 
 
 def test_diffusion_policy_learns_recorded_images_and_a_kill_does_not_matter(
     filmed, tmp_path, monkeypatch, small_images
 ):
     demonstrations = load_demonstrations(filmed)
-    policy = ImageDiffusion(Training(tmp_path / "whole", steps=26)).fit(demonstrations)
+    policy = ImageDiffusion(Training(tmp_path, steps=26)).fit(demonstrations)
     losses = policy.trained_.losses
     assert losses[-10:].mean() < 0.6 * losses[:5].mean()
     assert policy.rate_hz == 11.0
-    monkeypatch.setattr(training, "SAVE_EVERY_S", 0.3)
+    whole = ImageDiffusion(Training(tmp_path / "whole", steps=8)).fit(demonstrations)
+    monkeypatch.setattr(training, "SAVE_EVERY_S", 0.0)
     with pytest.raises(Killed):
-        ImageDiffusion(Training(tmp_path / "cut", steps=26, report=killed_at(18))).fit(demonstrations)
+        ImageDiffusion(Training(tmp_path / "cut", steps=8, report=killed_at(5))).fit(demonstrations)
     assert list((tmp_path / "cut").glob("*.unfinished.safetensors"))
-    resumed = ImageDiffusion(Training(tmp_path / "cut", steps=26)).fit(demonstrations)
-    one, other = load_file(policy.trained_.path), load_file(resumed.trained_.path)
+    resumed = ImageDiffusion(Training(tmp_path / "cut", steps=8)).fit(demonstrations)
+    one, other = load_file(whole.trained_.path), load_file(resumed.trained_.path)
     assert all(torch.equal(one[name], other[name]) for name in one)
     rehearsal = policy.rehearse(1)[0]
     assert rehearsal.samples.shape == (1, *rehearsal.shown.shape)
@@ -223,12 +238,12 @@ def test_what_cannot_be_learned_from_is_refused(demonstrations, tmp_path, workbe
 
 
 def test_the_command_trains_what_an_evaluation_then_finds(workbench, demonstrations, tmp_path, capsys):
-    command = ["train", "--task", "push-cube", "--demos", str(workbench / "data" / "push-cube"), "--steps", "5"]
+    command = ["train", "--task", "push-cube", "--demos", str(workbench / "data" / "push-cube"), "--steps", "2"]
     assert main([*command, "--method", "kat-dp", "--out", str(tmp_path)]) == 0
-    assert "5 steps in" in capsys.readouterr().out
+    assert "2 steps in" in capsys.readouterr().out
     assert "demonstration 2" in next(tmp_path.glob("*.svg")).read_text()
     # An evaluation names the network that "auto" stands for.
-    make_policy("kat-dp", None, ONE, Training(tmp_path, steps=5, report=refused)).fit(demonstrations)
+    make_policy("kat-dp", None, ONE, Training(tmp_path, steps=2, report=refused)).fit(demonstrations)
     assert main([*command, "--method", "rip", "--out", str(tmp_path)]) == 2
     assert "known: dp, kat-dp" in capsys.readouterr().err
 
@@ -244,12 +259,12 @@ def test_an_evaluation_trains_diffusion_policy_and_executes_it(filmed, workbench
     assert (executed.scene, executed.variant, executed.candidates) == (scene, variant, 1)
 
 
-def test_the_report_of_an_evaluation_shows_what_was_learned(workbench, demonstrations, tmp_path, monkeypatch):
-    monkeypatch.chdir(workbench)  # where data/push-cube is
-    command = ["eval", "--tasks", "push-cube", "--methods", "kat-dp", "--steps", "5", "--episodes", "1", "--no-videos"]
+def test_the_report_of_an_evaluation_shows_what_was_learned(reach, in_this_process, tmp_path, monkeypatch):
+    monkeypatch.chdir(reach)
+    command = ["eval", "--tasks", "metaworld/reach", "--methods", "kat-dp", "--episodes", "1", "--no-videos"]
     places = ["--checkpoints", str(tmp_path), "--out", str(tmp_path / "run")]
-    assert main([*command, "--demos", str(len(demonstrations)), *places]) == 0
-    (picture,) = (tmp_path / "run" / "training").glob("push-cube-kat-dp-*-5steps-*.svg")
+    assert main([*command, "--steps", "2", "--demos", "3", *places]) == 0
+    (picture,) = (tmp_path / "run" / "training").glob("metaworld-reach-kat-dp-*-2steps-*.svg")
     assert "demonstration 2" in picture.read_text()
     page = (tmp_path / "run" / "index.html").read_text()
     assert page.count('<h2 id="training">') == page.count('href="#training"') == 1

@@ -1,4 +1,4 @@
-"""Workers, failures taken apart, and the page: on the real simulator, with the method that needs no language model."""
+"""Workers, failures taken apart, and the page: on real simulators, with the method that needs no language model."""
 
 import contextlib
 import multiprocessing
@@ -19,7 +19,6 @@ import pytest
 
 from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
-from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation import (
     Choice,
@@ -45,6 +44,8 @@ from robust_instant_policy.policies import LocatedScene, Neighbours, Stage
 from robust_instant_policy.reporting.publication import publish
 from robust_instant_policy.tasks import make_task
 
+TASK = "metaworld/reach"  # of those that run in processes of their own; it starts soonest
+DATA = Path("data") / "metaworld-reach"
 SHOWN = 3
 NEIGHBOURS = Variant("neighbours", demos=SHOWN)
 DEADLINE_S = 300.0  # what rip eval takes where nothing is said
@@ -61,7 +62,7 @@ def is_running(process: int) -> bool:
 
 
 def suites_of(num_scenes: int, **settings) -> list[Suite]:
-    return make_suites(["chosen"], Choice(replace(NEIGHBOURS, **settings), ["push-cube"], ["neighbours"], num_scenes))
+    return make_suites(["chosen"], Choice(replace(NEIGHBOURS, **settings), [TASK], ["neighbours"], num_scenes))
 
 
 def setup_in(folder: Path, data: Path) -> Setup:
@@ -69,13 +70,13 @@ def setup_in(folder: Path, data: Path) -> Setup:
 
 
 @pytest.fixture(scope="module")
-def interrupted(workbench, tmp_path_factory) -> tuple[Path, int, str]:
+def interrupted(reach, tmp_path_factory) -> tuple[Path, int, str]:
     """Folder, exit status and last words of an evaluation with one worker, stopped with Ctrl-C after three scenes."""
     folder = tmp_path_factory.mktemp("interrupted")
     code = "import sys; from robust_instant_policy.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "eval", "--methods", "neighbours", "--demos", str(SHOWN)]
-    command += ["--tasks", "push-cube", "--episodes", "300", "--no-videos", "--out", str(folder)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=workbench)
+    command += ["--tasks", TASK, "--episodes", "300", "--no-videos", "--out", str(folder)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=reach)
     assert process.stdout is not None
     seen = 0
     for line in process.stdout:
@@ -108,10 +109,10 @@ def test_a_row_says_which_network_code_and_demonstrations_made_it(recorded):
     assert re.fullmatch(r"[0-9a-f]{12}", variant.demonstrations)
 
 
-def test_an_evaluation_whose_executions_are_there_does_nothing(recorded, interrupted, workbench, tmp_path):
+def test_an_evaluation_whose_executions_are_there_does_nothing(recorded, interrupted, reach, tmp_path):
     folder = tmp_path / "again"
     shutil.copytree(interrupted[0], folder)
-    for data in (workbench / "data", tmp_path / "no demonstrations here"):
+    for data in (reach / "data", tmp_path / "no demonstrations here"):
         run_suites(suites_of(3), setup_in(folder, data), folder, no_workers)
     assert read_results(folder).episodes == recorded
     # sys.argv is another program's here
@@ -135,49 +136,48 @@ def handed_out(folder: Path, data: Path, suites: list[Suite], keep: bool = False
     return sum(counts), notes
 
 
-def test_rows_of_other_code_are_run_again_and_told_or_kept_on_demand(interrupted, workbench, tmp_path):
+def test_rows_of_other_code_are_run_again_and_told_or_kept_on_demand(interrupted, reach, tmp_path):
     old = tmp_path / "old"
     with closing(ResultsStore(old)) as store:
         rows = read_results(interrupted[0]).episodes
         store.add(*(replace(row, variant=replace(row.variant, code="0123456789ab")) for row in rows))
-    again, notes = handed_out(old, workbench / "data", suites_of(3))
+    again, notes = handed_out(old, reach / "data", suites_of(3))
     assert again == 3
     assert "3 plans were executed with other code" in notes[0]
-    assert handed_out(old, workbench / "data", suites_of(3), keep=True) == (0, [])
+    assert handed_out(old, reach / "data", suites_of(3), keep=True) == (0, [])
 
 
-def test_plans_that_a_figure_needs_are_made_until_they_are_stored(interrupted, workbench, tmp_path):
+def test_plans_that_a_figure_needs_are_made_until_they_are_stored(interrupted, reach, tmp_path):
     folder = tmp_path / "again"
     shutil.copytree(interrupted[0], folder)
-    suites = make_suites(["trajectories"], Choice(NEIGHBOURS, ["push-cube"], ["neighbours"], 2))
+    suites = make_suites(["trajectories"], Choice(NEIGHBOURS, [TASK], ["neighbours"], 2))
     works: list[SceneWork] = []
 
     def plan_one(setup, missing):
         works.extend(missing)
-        policy = Neighbours().fit(load_demonstrations(workbench / "data/push-cube"))
-        plan = policy.plan(Observation.load(workbench / "observation.npz"))
+        shown = load_demonstrations(reach / DATA)
+        plan = Neighbours().fit(shown[:SHOWN]).plan(shown[SHOWN].observation)
         yield Planned(missing[0].scene, missing[0].plans[0], plan)
 
     for left in (2, 1):
         works.clear()
-        run_suites(suites, setup_in(folder, workbench / "data"), folder, plan_one)
+        run_suites(suites, setup_in(folder, reach / "data"), folder, plan_one)
         assert len(works) == left
         assert not any(work.variants for work in works)
 
 
-def test_rows_with_other_demonstrations_are_not_taken_for_ones_own(interrupted, workbench, tmp_path):
+def test_rows_with_other_demonstrations_are_not_taken_for_ones_own(interrupted, reach, tmp_path):
     again = tmp_path / "again"
     shutil.copytree(interrupted[0], again)
-    data = tmp_path / "data"
-    shown = load_demonstrations(workbench / "data/push-cube", limit=SHOWN + 1)
-    with DatasetWriter(data / "push-cube", "push-cube", "push", rate_hz=shown[0].rate_hz) as writer:
+    shown = load_demonstrations(reach / DATA)
+    with DatasetWriter(tmp_path / DATA, TASK, "reach", rate_hz=shown[0].rate_hz) as writer:
         for demonstration in shown[1:]:
             writer.add(demonstration)
     for keep in (False, True):
-        assert handed_out(again, data, suites_of(3), keep)[0] == 3
+        assert handed_out(again, tmp_path / "data", suites_of(3), keep)[0] == 3
 
 
-def test_two_workers_of_which_one_is_killed_write_the_rows_that_one_writes(recorded, workbench, tmp_path):
+def test_two_workers_of_which_one_is_killed_write_the_rows_that_one_writes(recorded, reach, tmp_path):
     killed = []
 
     def kill_one(done: int, total: int, what) -> None:
@@ -185,7 +185,7 @@ def test_two_workers_of_which_one_is_killed_write_the_rows_that_one_writes(recor
             killed.append(multiprocessing.active_children()[0].pid)
             os.kill(killed[0], signal.SIGKILL)
 
-    setup = setup_in(tmp_path, workbench / "data")
+    setup = setup_in(tmp_path, reach / "data")
     run_suites(suites_of(len(recorded)), setup, tmp_path, LocalWorkers(2), Progress(outcome=kill_one))
     assert killed
     assert timeless(read_results(tmp_path).episodes) == timeless(recorded)
@@ -212,7 +212,7 @@ def test_workers_end_at_once_with_the_evaluation_that_was_killed(tmp_path):
     assert not any(is_running(int(worker)) for worker in said if worker != "at work")
 
 
-def test_a_ray_cluster_on_which_a_worker_is_killed_writes_the_rows_that_a_process_writes(recorded, workbench, tmp_path):
+def test_a_ray_cluster_on_which_a_worker_is_killed_writes_the_rows_that_a_process_writes(recorded, reach, tmp_path):
     pytest.importorskip("ray")
     killed = []
 
@@ -221,7 +221,7 @@ def test_a_ray_cluster_on_which_a_worker_is_killed_writes_the_rows_that_a_proces
             killed.extend(ray_workers_of(os.getpid()))
             os.kill(killed[0], signal.SIGKILL)
 
-    setup = setup_in(tmp_path, workbench / "data")
+    setup = setup_in(tmp_path, reach / "data")
     run_suites(suites_of(2), setup, tmp_path, RayWorkers("local", 1), Progress(outcome=kill_one))
     assert len(killed) == 1
     assert timeless(read_results(tmp_path).episodes) == timeless(recorded[:2])
@@ -251,13 +251,13 @@ def test_two_evaluations_do_not_write_into_one_folder(tmp_path):
         os.close(lock)
 
 
-def test_an_error_in_a_worker_is_told_in_one_line(workbench, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(workbench)
-    command = ["eval", "--methods", "neighbours", "--tasks", "push-cube", "--demos", str(SHOWN), "--episodes", "1"]
+def test_an_error_in_a_worker_is_told_in_one_line(reach, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(reach)
+    command = ["eval", "--methods", "neighbours", "--tasks", TASK, "--demos", str(SHOWN), "--episodes", "1"]
     assert main([*command, "--objects", "unseen", "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert "unknown set of objects of push-cube" in error
+    assert "unknown set of objects of metaworld/reach" in error
 
 
 @pytest.fixture(scope="module")

@@ -78,10 +78,21 @@ def test_both_columns_of_table_ii_can_be_had_and_others_are_refused(url):
         rip.RobustInstantPolicy.paper(llm, "virtual")
 
 
-def test_an_evaluation_in_the_papers_configuration_is_named_so(url, workbench, monkeypatch):
-    monkeypatch.chdir(workbench)
-    command = ["eval", "--config", "paper", "--features", "efficientnet", "--estimator", "em-number", "--demos", "5"]
-    command += ["--llm", f"{url}#stand-in-0", "--methods", "rip", "mean", "--episodes", "1", "--no-analysis"]
+def test_an_evaluation_in_the_papers_configuration_is_named_so(url, reach, in_this_process, monkeypatch):
+    monkeypatch.chdir(reach)
+    command = ["eval", "--config", "paper", "--features", "efficientnet", "--estimator", "em-number", "--demos", "4"]
+    command += [
+        "--tasks",
+        "metaworld/reach",
+        "--llm",
+        f"{url}#stand-in-0",
+        "--methods",
+        "rip",
+        "mean",
+        "--episodes",
+        "1",
+        "--no-analysis",
+    ]
     assert main([*command, "--out", "runs/paper-config"]) == 0
     rows = pq.read_table("runs/paper-config/episodes.parquet").to_pylist()
     assert [(row["method"], row["config"], row["estimator"], row["keypoints"]) for row in rows] == [

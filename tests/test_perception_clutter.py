@@ -8,6 +8,7 @@ import pytest
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import make_pose, project
 from robust_instant_policy.perception import KeypointExtractor
+from robust_instant_policy.perception.view import make_view
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.trajectory import Trajectory
 
@@ -115,9 +116,9 @@ def test_more_pixels_do_not_lose_a_small_thing_and_a_smaller_one_is_told():
     assert found[-1] is True
 
 
-def path_to(x: float, y: float, start=(0.0, 0.0, 0.4)) -> Trajectory:
-    """The fingertips' middle from ``start`` to the place, down, and up again with the gripper closed."""
-    tips = np.array([start, [x, y, 0.15], [x, y, 0.04], [x, y, 0.04], [x, y, 0.2]])
+def path_to(x: float, y: float, start=(0.0, 0.0, 0.4), height=0.04) -> Trajectory:
+    """The fingertips' middle from ``start`` to the place, down to ``height``, and up again with the gripper closed."""
+    tips = np.array([start, [x, y, 0.15], [x, y, height], [x, y, height], [x, y, 0.2]])
     up, side = np.array([0, 0, 0.1]), np.array([0, 0.02, 0])
     actions = np.concatenate([tips + up, tips + side, tips - side], axis=1)
     return Trajectory(np.column_stack([actions, [0, 0, 0, 1, 1]]), np.linspace(0, 1, len(tips)))
@@ -130,6 +131,9 @@ def test_a_gripper_in_the_image_gets_no_keypoints_and_is_told():
     paths = [path_to(*blocks[0][:2], start=(0.24, 0.0, 0.15)) for blocks in scenes]
     extractor = KeypointExtractor(features="efficientnet").fit(images[:4], paths[:4])
     assert set(owners(extractor.pixels_[0], images[0], scenes[0])) == {0}
+    view = make_view(images[0], extractor.network_)
+    on_it, under_it, beside_the_image = (0.24, 0.0, 0.25), (0.3, 0.0, 0.0), (0.5, 0.0, -0.1)
+    assert view.hides(np.array([on_it, under_it, beside_the_image])).tolist() == [False, True, False]
     located = extractor.locate(images[4])
     assert set(owners(located.pixels, images[4], scenes[4])) == {0}
     assert any("arm is in the image" in note for note in located.notes)
@@ -176,6 +180,22 @@ def test_a_small_thing_in_a_box_of_its_colour_is_an_object_of_its_own():
     for blocks, image, _ in scenes[5:]:
         now = np.array(owners(extractor.locate(image).pixels, image, blocks)) == 0
         assert (now & on_cube).sum() >= 0.8 * on_cube.sum()
+
+
+@pytest.mark.parametrize("hole_moves", [False, True])
+def test_a_thing_in_a_hole_of_the_table_has_keypoints(hole_moves):
+    scenes = []
+    for seed, (x, y) in enumerate(np.random.default_rng(0).uniform(-0.05, 0.05, (5, 2))):
+        hole = (0.05 * seed * hole_moves, -0.04 * seed * hole_moves)
+        thing = (hole[0] + x, hole[1] + y, 0.025, -0.03, COLOURS[0])
+        scenes.append((thing, photograph([(*hole, 0.09, -0.08, ((90, 70, 55),) * 2), thing])))
+    paths = [path_to(*thing[:2], height=-0.03) for thing, _ in scenes]
+    images = [image for _, image in scenes]
+    extractor = KeypointExtractor(features="efficientnet").fit(images[:4], paths[:4])
+    known = owners(extractor.pixels_[0], images[0], [scenes[0][0]])
+    assert known.count(0) >= 3
+    found = owners(extractor.locate(images[4]).pixels, images[4], [scenes[4][0]])
+    assert [own for own, was in zip(found, known, strict=True) if was == 0] == [0] * known.count(0)
 
 
 def test_a_thing_that_a_rod_hides_in_part_is_one_thing_and_found():

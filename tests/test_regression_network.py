@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robust_instant_policy.errors import InvalidValueError, MissingExtraError, UnknownNameError
-from robust_instant_policy.regression import StudentTNetwork, robust_gripper_trajectory
+from robust_instant_policy.regression import StudentTNetwork, network, robust_gripper_trajectory
 from tests.regression_scenes import draw_scene
 
 torch = pytest.importorskip("torch")
@@ -46,7 +46,9 @@ def test_the_robust_network_beats_the_gaussian_and_the_fast_way_reaches_the_loss
     assert np.argmin([weight.mean() for weight in fast.weights]) == np.flatnonzero(scene.hallucinated)[0]
 
 
-def test_result_has_the_interface_of_the_regression(candidates, scene):
+def test_result_has_the_interface_of_the_regression(candidates, scene, monkeypatch):
+    for steps in ("WARM_STEPS", "QUASI_NEWTON_STEPS"):
+        monkeypatch.setattr(network, steps, 50)
     result = robust_gripper_trajectory(scene.candidates, estimator="network")
     assert result.actions.shape == (30, 10)
     assert np.isfinite(result.scale).all()

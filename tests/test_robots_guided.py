@@ -199,7 +199,7 @@ def test_the_command_calibrates_from_a_board_at_a_stated_place(tmp_path, monkeyp
         frame = camera.read()
         Observation(frame.rgb, frame.depth, frame.intrinsics, np.eye(4)).save(folder / f"{index}.npz")
     robot = tmp_path / "cell.toml"
-    text = CELL.format(park=PARK.tolist(), follower="/dev/null", leader="/dev/null", pace=1)
+    text = CELL.format(park=PARK.tolist(), follower="/dev/null", leader="/dev/zero", pace=1)
     robot.write_text(text[: text.index("[emulation]")])
     answer(monkeypatch, "\n" * len(PLACES))
     command = ["calibrate", "camera", "--robot", str(robot), "--places", str(len(PLACES))]

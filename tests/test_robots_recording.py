@@ -2,12 +2,17 @@
 
 import io
 import json
+import multiprocessing
+import os
 import resource
+import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +30,7 @@ from robust_instant_policy.robots.journal import Journal
 from robust_instant_policy.robots.operator import ENTER
 from robust_instant_policy.robots.recording import APPROACH_RAD_S
 from robust_instant_policy.robots.session import keep_calibration
+from robust_instant_policy.robots.signals import stop_on_signals
 from robust_instant_policy.robots.station import Station
 from tests.robot_cell import Cell, Scripted, shown, teaches
 from tests.robots_cells import write_cell
@@ -156,6 +162,30 @@ def test_a_request_to_stop_holds_the_arm_and_keeps_the_episode(cell, tmp_path):
     assert np.abs(cell.twin.commands[-1, 0, :-1] - still).max() < 0.2
 
 
+def test_a_request_to_stop_ends_the_waiting_for_a_camera_that_hangs(cell, tmp_path):
+    here, _there = multiprocessing.Pipe()
+
+    class Hanging:
+        name = "hanging"
+
+        def read(self):
+            threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+            here.poll(60)  # as `LiveCamera` waits
+            pytest.fail("it waited on")
+
+    with (
+        Station(cell.config) as station,
+        DatasetWriter(tmp_path / "demos", "turn", "turn it", 50) as writer,
+        stop_on_signals() as stop,
+    ):
+        operator = Scripted(KEEP)
+        operator.stop = stop
+        session = replace(cell.session(station, writer, operator), camera=Hanging())
+        with pytest.raises(StoppedError, match="Ctrl-C; the arms hold their position"):
+            session.record(1)
+    assert not cell.follower.limp
+
+
 def test_an_unplugged_leader_stops_the_follower_and_keeps_the_episode(cell, tmp_path):
     teach = None
 
@@ -198,11 +228,11 @@ def test_the_page_shows_the_live_picture_and_the_keypoints_of_the_start_image(ce
     camera = LiveCamera(cell.config.camera, tmp_path, tmp_path / "demos", cell.config.limits.workspace)
     camera.connect()
     try:
-        camera.say("hold the leader <here>")
         frame = camera.read()
         camera.show(Observation(frame.rgb, frame.depth, frame.intrinsics, np.eye(4)))
+        camera.say("hold the leader <here>")
         within(20, lambda: b"once there is a demonstration" in get("/start"))
-        assert json.loads(get("/state"))["line"] == "hold the leader <here>"
+        within(20, lambda: json.loads(get("/state"))["line"] == "hold the leader <here>")
         shown = np.asarray(Image.open(io.BytesIO(get("/live.jpg"))), dtype=float)
         grey = (image @ [0.299, 0.587, 0.114] for image in (shown, frame.rgb))  # JPEG keeps fewer colours
         assert np.corrcoef(*map(np.ravel, grey))[0, 1] > 0.9

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 from robust_instant_policy import Plan
 from robust_instant_policy.cli import main
 from robust_instant_policy.reporting.run import RunRecord
-from robust_instant_policy.robots.cell import CELLS
+from robust_instant_policy.robots.cell import CELLS, CellConfig
+from robust_instant_policy.robots.emulation.client import emulated
 from robust_instant_policy.robots.path import MeasuredPath, Sweep
 from tests.robots_cells import arms_of
 
@@ -28,12 +30,22 @@ def cell(workbench):
     return path
 
 
+@pytest.fixture
+def emulation(cell, monkeypatch):
+    """The cell runs once, for all commands of a test."""
+    with emulated(CellConfig.load(cell)) as emulation:
+        monkeypatch.setattr(
+            "robust_instant_policy.commands.run.devices_of", lambda config: nullcontext((emulation.config, emulation))
+        )
+        yield emulation
+
+
 def run(cell, *more: str) -> int:
     return main(["run", "--robot", str(cell), "--demos", "data/push-cube", *more])
 
 
 def test_a_plan_is_made_refused_where_it_does_not_belong_and_executed_where_it_does(
-    cell, workbench, monkeypatch, capsys
+    cell, emulation, workbench, monkeypatch, capsys
 ):
     monkeypatch.chdir(workbench)
     assert run(cell, "--dry-run", "--out", "runs/cell") == 0
@@ -50,6 +62,20 @@ def test_a_plan_is_made_refused_where_it_does_not_belong_and_executed_where_it_d
 
     assert run(cell, "--plan", str(folder)) == 2  # nobody is there to be asked
     assert "use --yes" in capsys.readouterr().err
+    plan = Plan.load(folder / "plan.json")
+    for changed, words in (
+        (replace(plan, cell="0123456789abcdef"), "made for another calibration, gripper or cell"),
+        (replace(plan, confidence=0.3), "confidence is 0.30, the limit is 0.90 (min_confidence in"),
+    ):
+        (folder / "measured.npz").touch()  # of an earlier run
+        changed.save(folder / "plan.json")
+        assert run(cell, "--yes", "--plan", str(folder)) == 1
+        assert words in capsys.readouterr().err
+        assert not (folder / "measured.npz").exists()
+        assert RunRecord.load(folder).outcome == "planned, not executed"
+    assert not emulation.commands().size
+
+    plan.save(folder / "plan.json")
     assert run(cell, "--yes", "--speed", "1", "--plan", str(folder)) == 0
     record = RunRecord.load(folder)
     assert record.success, record.outcome
@@ -58,17 +84,6 @@ def test_a_plan_is_made_refused_where_it_does_not_belong_and_executed_where_it_d
     page = (folder / "report.html").read_text()
     assert "Execution: commanded and measured" in page
     assert record.outcome in page
-
-    plan = Plan.load(folder / "plan.json")
-    for changed, words in (
-        (replace(plan, cell="0123456789abcdef"), "made for another calibration, gripper or cell"),
-        (replace(plan, confidence=0.3), "confidence is 0.30, the limit is 0.90 (min_confidence in"),
-    ):
-        changed.save(folder / "plan.json")
-        assert run(cell, "--yes", "--plan", str(folder)) == 1
-        assert words in capsys.readouterr().err
-        assert not (folder / "measured.npz").exists()  # that of the run before
-        assert RunRecord.load(folder).outcome == "planned, not executed"
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import socketserver
 import threading
 
 import numpy as np
+import psutil
 import pytest
 
 from robust_instant_policy.errors import RobotError, StoppedError
@@ -20,7 +21,7 @@ from tests.robots_cells import after, reach, write_cell
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no release for Python 3.13")
 
-from robust_instant_policy.robots.followers.ur import GRIPPER_PORT, RobotiqGripper
+from robust_instant_policy.robots.rtde import GRIPPER_PORT, RobotiqGripper
 
 POINTS = ((0.0, 0.0, 0.05), (0.0, 0.0, 0.01), (0.0, 0.0, 0.05))
 
@@ -59,20 +60,29 @@ def test_a_plan_is_executed_as_planned_with_the_gripper(emulated):
     np.testing.assert_allclose(emulation.commands()[-1, 0, :6], motion.joints[-1, 0], atol=1e-3)
 
 
+def end_library():
+    (process,) = [one for one in psutil.Process().children() if "robust_instant_policy.robots.rtde" in one.cmdline()]
+    process.kill()
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("protective-stop", r"protective stop|no longer takes targets"),
+        ("protective-stop", "protective stop; see the teach pendant for the reason"),
         ("frozen", r"frozen|away from its command"),
         ("silent", "does not answer"),
         ("nan", "not numbers"),
+        ("library's process ends", "the connection to .* was lost, and the UR library with it"),
     ],
 )
 def test_a_fault_stops_the_arm_and_a_later_run_works_again(emulated, fault, words):
     config, emulation = emulated
     with Station(config) as station:
         motion = pick(station)
-        thread = after(emulation, 40, emulation.fault, "hand-e", fault)
+        if "ends" in fault:
+            thread = after(emulation, 40, end_library)
+        else:
+            thread = after(emulation, 40, emulation.fault, "hand-e", fault)
         played = station.play(motion, StopRequest())
         thread.join()
         assert re.search(words, played.stopped)

@@ -153,10 +153,12 @@ def test_a_signal_brakes_the_arm_on_its_path_and_it_keeps_its_torque(emulated, n
     assert emulation.limp() == []
 
 
-def test_an_arm_that_stands_elsewhere_does_not_jump_to_the_plan(emulated):
+def test_an_arm_that_stands_elsewhere_does_not_jump_to_the_plan_and_obeys_one_program(emulated):
     config, _ = emulated
     with Station(config) as station:
         motion = pick(station)
+        with pytest.raises(RobotError, match="another program uses it"), Station(config):
+            pytest.fail("two programs command one arm")
         elsewhere = replace(motion, joints=motion.joints + 0.3)
         played = station.play(elsewhere, StopRequest())
         assert "rad away from where the motion begins" in played.stopped
@@ -185,8 +187,12 @@ def test_a_servo_that_is_missing_is_named(own):
 
 def test_robot_check_says_what_is_well_and_what_is_not(tmp_path, capsys):
     path = write_cell(tmp_path, "left")
+    leader = 'leader = { kind = "gello", port = "/dev/nowhere", calibration = "leader.toml" }'
+    path.write_text(path.read_text().replace("driver", f"{leader}\ndriver"))
     assert main(["robot", "check", "--robot", str(path)]) == 1
     said = capsys.readouterr().out
+    assert re.search(r"ok    left: its clock advances by \d+\.\d\d s a second", said)
+    assert "WRONG the leader of left is not calibrated" in said
     assert "left: 95% of the states within" in said  # how fast depends on the machine
     assert "ok    left: at its park pose" in said
     assert "WRONG this emulated cell has no scene and no camera" in said

@@ -284,8 +284,16 @@ def test_a_plan_is_made_shown_and_executed(studio):
     view.get_by_role("button", name="Plan", exact=True).click()
     view.get_by_role("button", name="Cancel").click()
     view.get_by_text("Planning was cancelled").wait_for(timeout=1000 * PATIENCE_S)
+    view.evaluate(
+        "() => { window.said = new Set(); new MutationObserver(() => (document.body.textContent.match("
+        "/(Confidence [01].\\d\\d: )?\\d of \\d candidates/g) ?? []).forEach(words => said.add(words)))"
+        ".observe(document.body, {childList: true, characterData: true, subtree: true}) }"
+    )
     view.get_by_role("button", name="Plan", exact=True).click()
-    view.get_by_text("5 of 5 candidates").wait_for(timeout=3000 * PATIENCE_S)
+    view.get_by_text(re.compile(r"^Confidence [01].\d\d: 5 of 5 candidates")).wait_for(timeout=3000 * PATIENCE_S)
+    early = {words for words in view.evaluate("[...said]") if "5 of 5" not in words}
+    assert early
+    assert not any("Confidence" in words for words in early), "some of the candidates say little"
     assert view.locator(".keypoint").count() == 10
     for mark in view.locator(".keypoint").all():
         mark.hover()  # fails where the pointer cannot reach it

@@ -26,6 +26,7 @@ ENVIRONMENTS = (
     "RIP-PushCubeAnywhere-v1", "RIP-Stack-v1", "RIP-Wipe-v1", "RIP-Sort-v1",
 )  # fmt: skip
 VISIBLE_PIXELS = 25
+ONE_SET = ("pick-banana", "push-cube", "open-drawer")  # of objects
 
 
 @pytest.fixture(scope="module", params=MOVING_PART)
@@ -41,11 +42,11 @@ def attempts(task):
 
 
 def test_the_demonstrator_succeeds_and_its_recording_replays(task, attempts):
-    for seed, attempt in attempts.items():
+    for attempt in attempts.values():
         assert attempt.success, attempt.failure
-        task.reset(seed)
-        execution = task.execute(downsample(attempt.demonstration.trajectory, "masked"))
-        assert execution.success, execution.failure
+    task.reset(SEEDS[-1])
+    execution = task.execute(downsample(attempts[SEEDS[-1]].demonstration.trajectory, "masked"))
+    assert execution.success, execution.failure
 
 
 def test_no_two_episodes_are_performed_alike(attempts):
@@ -79,25 +80,19 @@ def test_doing_nothing_fails_in_words(task, attempts):
     assert len(execution.failure) > 10
 
 
-@pytest.mark.parametrize("name", ["close-cabinet", "turn-faucet", "push-cube-anywhere", "stack", "wipe", "sort"])
-def test_unseen_objects_are_other_objects_and_can_be_used_as_well(name):
-    task = make_task(name, objects="unseen")
+def test_unseen_objects_are_other_objects_and_can_be_used_as_well(task, attempts):
+    if task.name in ONE_SET:
+        with pytest.raises(UnknownNameError, match="known: seen"):
+            make_task(task.name, objects="unseen")
+        return
+    other = make_task(task.name, objects="unseen")
     try:
-        attempt = task.demonstrate(SEEDS[0])
+        attempt = other.demonstrate(SEEDS[0])
         assert attempt.success, attempt.failure
-        unseen = attempt.demonstration.observation.rgb
     finally:
-        task.close()
-    task = make_task(name, objects="seen")
-    try:
-        assert not np.array_equal(task.reset(SEEDS[0]).rgb, unseen)
-    finally:
-        task.close()
-
-
-def test_a_task_without_unseen_objects_says_so():
-    with pytest.raises(UnknownNameError, match="known: seen"):
-        make_task("push-cube", objects="unseen")
+        other.close()
+    seen, unseen = (one.demonstration.observation.rgb for one in (attempts[SEEDS[0]], attempt))
+    assert not np.array_equal(seen, unseen)
 
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)

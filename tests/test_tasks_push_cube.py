@@ -32,7 +32,7 @@ def test_the_camera_sees_the_goal_where_it_is(task):
     observation = task.reset(11)
     truth = task.scene_truth()
     rows, columns = np.nonzero(truth.parts == truth.names.index("goal"))
-    centre = truth.world_point((0.0, 0.0, 0.0), "goal")
+    centre = truth.poses[truth.names.index("goal")][:3, 3]
     seen = np.array([columns.mean(), rows.mean()])
     np.testing.assert_allclose(project(centre, observation.intrinsics, observation.camera_pose), seen, atol=0.2)
     pixels = np.stack([columns, rows], axis=1)
@@ -90,13 +90,9 @@ def test_executing_twice_starts_again_from_the_scene_of_the_last_reset(task, att
 @pytest.mark.parametrize("method", ["masked", "uniform"])
 def test_a_demonstration_replays_in_its_own_scene(task, attempt, method):
     task.reset(3)
-    frames = []
-    execution = task.execute(downsample(attempt.demonstration.trajectory, method), frames.append)
+    execution = task.execute(downsample(attempt.demonstration.trajectory, method))
     assert execution.success, execution.failure
     assert execution.tracking_error < 0.02
-    assert len(frames) > 50
-    assert frames[0].dtype == np.uint8
-    assert not np.array_equal(frames[0], frames[-1])
 
 
 def test_pushing_the_wrong_cube_fails_in_words(task, attempt):

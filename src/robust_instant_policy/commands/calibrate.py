@@ -107,7 +107,8 @@ def _camera(options: argparse.Namespace) -> None:
             raise CellError(f'{options.robot}: give the table [camera] calibration = "camera.toml", the file to write')
         board = _the_board(options)
         camera = make_camera(cell.config.camera, cell.config.path.parent)
-        camera.connect()
+        with cell.terminal.stop.ends_waiting():
+            camera.connect()
         try:
             result = _calibrated(options, cell, camera, board)
         finally:
@@ -171,13 +172,13 @@ def _leader(options: argparse.Namespace) -> None:
             raise CellError(
                 f'{options.robot}: give the leader of {arm.name} calibration = "leader.toml", the file to write'
             )
-        with cell.station:
-            source.connect()
-            try:
-                cell.park()
-                joints = copied_turns(cell.station, source, index, cell.terminal)
-            finally:
-                source.disconnect()
+        with ExitStack() as stack:
+            with cell.terminal.stop.ends_waiting():
+                stack.enter_context(cell.station)
+                source.connect()
+                stack.callback(source.disconnect)
+            cell.park()
+            joints = copied_turns(cell.station, source, index, cell.terminal)
     joints.save(cell.config.path.parent / str(file))
     print(f"{file}: channels {joints.channels.tolist()}, signs {joints.signs.astype(int).tolist()}")
 
@@ -204,12 +205,12 @@ class _Cell:
         leader = make_leader(
             arm, self.station.arms[index], self.station.rate_hz, self.config.path.parent, self.terminal.pressed
         )
-        with self.station:
-            leader.connect()
-            try:
-                yield Guide(self.station, leader, index, self.terminal)
-            finally:
-                leader.disconnect()
+        with ExitStack() as stack:
+            with self.terminal.stop.ends_waiting():
+                stack.enter_context(self.station)
+                leader.connect()
+                stack.callback(leader.disconnect)
+            yield Guide(self.station, leader, index, self.terminal)
 
     def park(self) -> None:
         self.terminal.say("the arms go to their park pose")

@@ -14,7 +14,6 @@ import json
 import multiprocessing
 import os
 import re
-import select
 import signal
 import threading
 import time
@@ -22,6 +21,7 @@ from collections.abc import Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing.connection import Connection
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from numpy.typing import NDArray
@@ -44,6 +44,7 @@ MOST_SHARE = 0.2  # of the camera's time for them
 JPEG_QUALITY = 80
 NICE = 5  # the process that commands the arms goes first
 STARTING_S, READING_S = 60.0, 40.0
+ENDING_S = 0.7  # of a camera that hangs
 SIGNALS = (signal.SIGINT, signal.SIGHUP)
 
 
@@ -58,13 +59,15 @@ class LiveCamera:
         self.name, self.url = config.kind, ""
         context = multiprocessing.get_context("spawn")
         self._wire, self._theirs = context.Pipe()
-        self._sending = threading.Lock()
+        self._outbox: SimpleQueue[tuple[str, object] | None] = SimpleQueue()  # nobody waits for the process to take it
+        self._sender = threading.Thread(target=self._send, daemon=True)
         device = (config.kind, dict(config.options), config.where)
         self._process = context.Process(
             target=_serve, args=(self._theirs, device, folder, demos, workspace), daemon=True, name="camera"
         )
 
     def connect(self) -> None:
+        self._sender.start()
         # Ctrl-C is the recording process's, also while the other one starts, which inherits what is blocked.
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
@@ -75,33 +78,36 @@ class LiveCamera:
         self.name, self.url = self._answer(STARTING_S)
 
     def read(self) -> Frame:
-        self._send("read", None)
+        self._outbox.put(("read", None))
         frame: Frame = self._answer(READING_S)
         return frame
 
     def show(self, start: Observation) -> None:
         """Mark the keypoints of the demonstrations in the ``start`` image, once they are found."""
-        threading.Thread(target=self._send, args=("start", start), daemon=True).start()  # megabytes
+        self._outbox.put(("start", start))
 
     def say(self, line: str) -> None:
-        """Show what the person was told last. Never waits."""
-        with contextlib.suppress(OSError):  # it may be closed
-            if not self._sending.locked() and select.select([], [self._wire], [], 0)[1]:
-                self._send("line", line)
+        """Show what the person was told last."""
+        self._outbox.put(("line", line))
 
     def disconnect(self) -> None:
-        self._wire.close()  # it ends then
-        self._process.join(5.0)
-        self._process.kill()
+        if self._process.pid is not None:
+            self._outbox.put(None)
+            self._sender.join(ENDING_S)
+            if self._sender.is_alive():
+                self._process.kill()
+                self._sender.join()
+        self._wire.close()  # the process ends then
+        if self._process.pid is not None:
+            self._process.join(ENDING_S)
+            self._process.kill()
 
-    def _send(self, what: str, value: object) -> None:
-        """A failure is told by `_answer`: what is only shown on the page must not stop an arm."""
-        if self._sending.acquire(timeout=READING_S):
-            try:
-                with contextlib.suppress(OSError):
-                    self._wire.send((what, value))
-            finally:
-                self._sending.release()
+    def _send(self) -> None:
+        """Send what is in the outbox. A failure is told by `_answer`: what is only shown on the page must not stop an
+        arm."""
+        with contextlib.suppress(OSError):
+            while (message := self._outbox.get()) is not None:
+                self._wire.send(message)
 
     def _answer(self, seconds: float) -> Any:
         try:

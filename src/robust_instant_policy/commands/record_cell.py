@@ -39,7 +39,8 @@ def record_cell(options: argparse.Namespace) -> int:
             screen.say(line)
             camera.say(line)
 
-        terminal = stack.enter_context(Terminal(stack.enter_context(stop_on_signals()), say))
+        stop = stack.enter_context(stop_on_signals())
+        terminal = stack.enter_context(Terminal(stop, say))
         station = Station(config)
         leaders = [
             make_leader(one, arm, config.rate_hz, folder, terminal.pressed)
@@ -50,12 +51,13 @@ def record_cell(options: argparse.Namespace) -> int:
         next_scene = (
             None if emulation is None else partial(_next_scene, emulation, count(0 if last is None else last + 1))
         )
-        stack.enter_context(station)
-        for leader in leaders:
-            leader.connect()
-            stack.callback(leader.disconnect)
-        camera.connect()
-        stack.callback(camera.disconnect)
+        with stop.ends_waiting():
+            stack.enter_context(station)
+            for leader in leaders:
+                leader.connect()
+                stack.callback(leader.disconnect)
+            stack.callback(camera.disconnect)
+            camera.connect()
         screen.say(f"live picture and keypoints: {camera.url}")
         Session(station, leaders, camera, writer, terminal, camera.show, next_scene).record(options.episodes)
     screen.say(f"{options.out}: {writer.num_episodes} demonstrations of {options.task}, {writer.discarded} discarded")

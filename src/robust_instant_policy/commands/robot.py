@@ -15,7 +15,7 @@ import numpy as np
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import CellError
 from robust_instant_policy.motion.state import Command
-from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.cell import PACES, CellConfig
 from robust_instant_policy.robots.check import check_cell
 from robust_instant_policy.robots.emulation.client import devices_of
 from robust_instant_policy.robots.emulation.server import serve
@@ -53,7 +53,7 @@ def _twin(config: CellConfig) -> Twin:
     """The physics that the table [emulation] names: the scene ``seed`` of a ``task``, or arms without a scene."""
     section = config.emulation_section()
     name, seed = section.text("task", ""), section.whole("seed", 0)
-    section.number("pace", 1.0, 0.1, 1000.0)
+    section.number("pace", 1.0, *PACES)
     section.finish()
     if not name:
         arms = [arm_of(arm, config.path.parent) for arm in config.arms]

@@ -43,7 +43,7 @@ from robust_instant_policy.robots.execution import (
 )
 from robust_instant_policy.robots.path import Sweep
 from robust_instant_policy.robots.signals import stop_on_signals
-from robust_instant_policy.robots.station import HOLDING, Played, Station
+from robust_instant_policy.robots.station import Played, Station
 
 PLANNED, UNJUDGED = "planned, not executed", "executed, not judged"
 
@@ -153,12 +153,15 @@ class _Run:
             self._open_grippers(station)
             seconds = len(motion.joints) / station.rate_hz
             self._confirm(f"execute {seconds:.0f} s of motion at {100 * self._speed:.0f}% of the usual speed?")
-            with self._screen.stage("execution"), stop_on_signals() as stop:
-                played = station.play(motion, stop)
-            played.path.save(self._out / MEASURED_FILE)
-            grasps = played.path.empty_grasps([arm.name for arm in station.arms])
-            success, outcome = self._outcome(played)
-            self._report(record, success, [outcome, *grasps])
+            with stop_on_signals() as stop:  # also while the outcome is stored
+                with self._screen.stage("execution"):
+                    played = station.play(motion, stop)
+                played.path.save(self._out / MEASURED_FILE)
+                grasps = played.path.empty_grasps([arm.name for arm in station.arms])
+                success, outcome = self._outcome(played)
+                self._report(record, success, [outcome, *grasps])
+            if stop.reason and not played.stopped:
+                raise stop.error()
             if outcome == UNJUDGED and not self._options.yes:
                 success = _agrees("did it succeed?")
                 self._report(record, success, ["success" if success else "failed: judged so", *grasps])
@@ -182,7 +185,7 @@ class _Run:
         with self._screen.stage("open grippers"), stop_on_signals() as stop:
             open_grippers(station, stop)
         if stop.reason:
-            raise StoppedError(f"{stop.reason}; {HOLDING}")
+            raise stop.error()
 
     def _prepare(self, station: Station) -> tuple[Motion, RunRecord]:
         """A checked motion, and what is known of the run; the page shows both."""

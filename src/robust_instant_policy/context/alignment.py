@@ -1,7 +1,8 @@
-"""Align demonstrations at their gripper changes.
+"""Align demonstrations at their gripper changes, and between them by dynamic time warping.
 
 Each demonstration is split into segments of constant gripper state. Demonstrations with the same order of states are
-aligned segment by segment, so that "the last step before the grasp" is the same step in all.
+aligned segment by segment, so that "the last step before the grasp" is the same step in all. Within a segment a person
+or a scripted expert turns, waits and hurries at other times in each: there, steps that mean the same are matched.
 """
 
 from __future__ import annotations
@@ -18,6 +19,10 @@ from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 CURVATURE_MARGIN = 2.0  # a new scene may need this many times the curvature that was shown
 MIN_CURVATURE_M = 0.003
+MIN_WARPED_STEPS = 4  # of a segment
+WARPING_ROUNDS = 5
+WAITING_M = 0.003  # cost of a step in which a demonstration waits for the others, or they for it
+NOISE_M = 0.003  # of demonstrated points
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,17 +78,11 @@ def align(trajectories: Sequence[Trajectory]) -> AlignedDemonstrations:
         max(1, round(float(np.median([segments[index][part][2] - segments[index][part][1] for index in kept]))))
         for part in range(len(order))
     ]
-    actions = np.stack(
-        [
-            np.concatenate(
-                [
-                    _resampled(trajectories[index].actions[start:stop], length)
-                    for (_, start, stop), length in zip(segments[index], lengths, strict=True)
-                ]
-            )
-            for index in kept
-        ]
-    )
+    parts = [
+        _in_step([trajectories[index].actions[slice(*segments[index][part][1:])] for index in kept], length)
+        for part, length in enumerate(lengths)
+    ]
+    actions = np.concatenate(parts, axis=1)
     starts = np.cumsum([0, *lengths])
     edges = {0, int(starts[-1]) - 1, *map(int, starts[1:-1]), *(int(start) - 1 for start in starts[1:-1])}
     return AlignedDemonstrations(actions, kept, tuple(sorted(edges)))
@@ -96,7 +95,68 @@ def _segments(trajectory: Trajectory) -> list[tuple[tuple[int, ...], int, int]]:
     return [(states[start], start, stop) for start, stop in pairwise(edges)]
 
 
-def _resampled(actions: FloatArray, length: int) -> FloatArray:
-    at = np.linspace(0, len(actions) - 1, length) if length > 1 else np.array([len(actions) - 1.0])
+def _in_step(segments: Sequence[FloatArray], length: int) -> FloatArray:
+    """One segment of all demonstrations, ``(n, 10·A)`` each, at ``length`` steps that mean the same: ``(I, length,
+    10·A)``.
+
+    First resampled evenly; then in turn each step's place is fitted as a function of the segment's ends (`_typical`),
+    and each demonstration resampled where it comes nearest to these places, in order (`_warped_times`).
+    """
+    ends = [len(own) - 1.0 for own in segments]
+    times = [np.linspace(0, end, length) if length > 1 else np.array([end]) for end in ends]
+    if length >= MIN_WARPED_STEPS and len(segments) > 1:
+        even = [_at(own, at) for own, at in zip(segments, times, strict=True)]
+        paths = np.stack([_tips(own) for own in even])
+        warped = paths
+        for _ in range(WARPING_ROUNDS):
+            at = [_warped_times(*pair) for pair in zip(_typical(warped), paths, strict=True)]
+            warped = np.stack([_at(own, shares) for own, shares in zip(paths, at, strict=True)])
+        return np.stack([_at(own, shares) for own, shares in zip(even, at, strict=True)])
+    return np.stack([_at(own, at) for own, at in zip(segments, times, strict=True)])
+
+
+def _tips(actions: FloatArray) -> FloatArray:
+    """Middle between the fingertips of each arm ``(n, 3·A)``, metres."""
+    arms = actions.reshape(len(actions), -1, ACTION_DIM)
+    return arms[:, :, 3:STATE_INDEX].reshape(*arms.shape[:2], 2, 3).mean(axis=2).reshape(len(actions), -1)
+
+
+def _typical(paths: FloatArray) -> FloatArray:
+    """What is usual of ``paths (I, n, D)``, metres, for the ends of each: ``(I, n, D)``.
+
+    At each step a constant distance from the first point, and a share of the way to the last one.
+    """
+    first = paths[:, :1]
+    way = paths[:, -1:] - first
+    away, spread = paths - first, way - way.mean(axis=0)
+    share = (spread * away).sum(axis=(0, 2)) / ((spread**2).sum() + NOISE_M**2)
+    constant = np.median(away - share[:, None] * way, axis=0)
+    return first + constant + share[:, None] * way
+
+
+def _warped_times(path: FloatArray, other: FloatArray) -> FloatArray:
+    """Steps ``(n,)`` of ``other (m, D)`` that correspond to those of ``path (n, D)``, metres: dynamic time warping
+    (Sakoe and Chiba 1978), with a cost where one waits for the other."""
+    distance = np.linalg.norm(path[:, None] - other, axis=-1)
+    n, m = distance.shape
+    total = np.full((n + 1, m + 1), np.inf)
+    total[0, 0] = 0.0
+    for i in range(n):
+        for j in range(m):
+            waits = min(total[i, j + 1], total[i + 1, j]) + WAITING_M
+            total[i + 1, j + 1] = distance[i, j] + min(total[i, j], waits)
+    matched: list[list[int]] = [[] for _ in range(n)]
+    i, j = n, m
+    while i and j:
+        matched[i - 1].append(j - 1)
+        before = (total[i - 1, j - 1], total[i - 1, j] + WAITING_M, total[i, j - 1] + WAITING_M)
+        i, j = ((i - 1, j - 1), (i - 1, j), (i, j - 1))[int(np.argmin(before))]
+    times = np.array([float(np.mean(own)) for own in matched])
+    times[[0, -1]] = 0.0, m - 1.0
+    return times
+
+
+def _at(actions: FloatArray, times: FloatArray) -> FloatArray:
+    """``actions (n, D)`` between their steps, at ``times (m,)``."""
     steps = np.arange(len(actions))
-    return np.stack([np.interp(at, steps, column) for column in actions.T], axis=1)
+    return np.stack([np.interp(times, steps, column) for column in actions.T], axis=1)

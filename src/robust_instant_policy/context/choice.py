@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from robust_instant_policy.context.frames import Anchor, Axes, Frame
@@ -115,8 +116,9 @@ class Candidates:
         )
         return np.array([*ends, *range(OFFSET.start, OFFSET.stop + 3 * len(self.growing))])
 
-    def design(self, home: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """X ``(M, N, I, 3, P)`` of all combinations, and the P ridge penalties, of the `numbers` alone."""
+    def design(self, home: FloatArray, second: NDArray[np.bool_] | None = None) -> tuple[FloatArray, FloatArray]:
+        """X ``(M, N, I, 3, P)`` of all combinations, and the P ridge penalties, of the `numbers` alone; last, the
+        offset by which demonstrations of a ``second (I,)`` way differ."""
         scene, rotation = self.scene, self.rotations()
         deviations = np.array(
             [SHARE_STD] * 6 + [POINT_STD_M] * 9 + [OFFSET_STD_M] * 3 + [GROWTH_STD_M] * (3 * len(self.growing))
@@ -140,7 +142,11 @@ class Candidates:
                     )
                     own[..., 3 * (number - 1) :][..., : parts.shape[-1]] = parts
         numbers = self.numbers
-        return design[..., numbers], (NOISE_M / deviations[numbers]) ** 2
+        design, penalty = design[..., numbers], (NOISE_M / deviations[numbers]) ** 2
+        if second is None:
+            return design, penalty
+        offset = np.broadcast_to((second[:, None, None] * rotation)[:, None], (*design.shape[:-1], 3))
+        return np.concatenate([design, offset], axis=-1), np.append(penalty, [(NOISE_M / OFFSET_STD_M) ** 2] * 3)
 
     def rotations(self) -> FloatArray:
         """``(M, I, 3, 3)``."""
@@ -167,12 +173,15 @@ class Errors:
         return self.squared.mean(axis=-1) * np.exp(2 * self.penalty)
 
 
-def prediction_errors(candidates: Candidates, hands: FloatArray) -> Errors:
-    """Leave-one-out errors of all ``candidates`` for one arm's ``hands (I, T, 3, 3)`` (three points a step)."""
+def prediction_errors(candidates: Candidates, hands: FloatArray, second: NDArray[np.bool_] | None = None) -> Errors:
+    """Leave-one-out errors of all ``candidates`` for one arm's ``hands (I, T, 3, 3)`` (three points a step).
+
+    Demonstrations of a ``second (I,)`` way have an offset and a turn of their own in the same frame.
+    """
     demos = len(hands)
     centre = hands.mean(axis=2)  # (I, T, 3)
     home = centre[:, 0].mean(axis=0)
-    start, (design, penalty) = candidates.start(home), candidates.design(home)
+    start, (design, penalty) = candidates.start(home), candidates.design(home, second)
     m, n, _, _, p = design.shape
     flat = design.reshape(m, n, 3 * demos, p)
     gram = np.swapaxes(flat, -1, -2) @ flat + np.diag(penalty)
@@ -187,7 +196,7 @@ def prediction_errors(candidates: Candidates, hands: FloatArray) -> Errors:
     place = np.moveaxis((residual**2).sum(axis=3), -1, 0)  # (T, M, N, I)
     rotation = candidates.rotations()
     shape = np.einsum("miyx,itpy->mitpx", rotation, hands - centre[:, :, None])
-    rest = (shape - shape.mean(axis=1, keepdims=True)) * (demos / max(demos - 1, 1))
+    rest = _from_mean(shape, second, others=True)
     turn = np.moveaxis((rest**2).sum(axis=-1).mean(axis=-1), -1, 0)  # (T, M, I)
     squared = place + turn[:, :, None]
     expected = np.zeros((m, n))
@@ -196,7 +205,18 @@ def prediction_errors(candidates: Candidates, hands: FloatArray) -> Errors:
     else:
         expected = np.trace(hat, axis1=-2, axis2=-1) + 2 * np.array([[len(axes.ends) - 1] for axes in candidates.axes])
         expected = expected + np.array([[axes.ends[0].thing is not WORLD] for axes in candidates.axes])
+        expected = expected + (0 if second is None else 3)
     return Errors(squared, PARAMETER_COST * expected)
+
+
+def _from_mean(shape: FloatArray, second: NDArray[np.bool_] | None, others: bool = False) -> FloatArray:
+    """``shape (M, I, ...)`` less the mean over the demonstrations of the same way, or over the ``others`` of it."""
+    rest = np.empty_like(shape)
+    for way in (slice(None),) if second is None else (~second, second):
+        own = shape[:, way]
+        count = own.shape[1]
+        rest[:, way] = (own - own.mean(axis=1, keepdims=True)) * (count / max(count - 1, 1) if others else 1.0)
+    return rest
 
 
 def _guess(candidates: Candidates, offset: FloatArray, demos: int) -> FloatArray:
@@ -222,8 +242,16 @@ def _guess(candidates: Candidates, offset: FloatArray, demos: int) -> FloatArray
     return np.moveaxis(guess, -1, 0)[:, None] + suits[None, :, :, None]
 
 
-def choose_frames(things: Sequence[Thing], scene: Scene, hands: FloatArray, key_steps: Sequence[int]) -> list[Frame]:
+def choose_frames(
+    things: Sequence[Thing],
+    scene: Scene,
+    hands: FloatArray,
+    key_steps: Sequence[int],
+    second: NDArray[np.bool_] | None = None,
+) -> list[Frame]:
     """The frame of each step for one arm's ``hands (I, T, 3, 3)``, the gripper's three points in each demonstration.
+
+    Demonstrations of a ``second (I,)`` way share the frames with the others, see `prediction_errors`.
 
     Viterbi over the steps: leave-one-out error plus a cost for each change. Where lines suit, the points between which
     they run are fitted, and all is judged again; where a key step is not explained, with more origins.
@@ -231,16 +259,16 @@ def choose_frames(things: Sequence[Thing], scene: Scene, hands: FloatArray, key_
     weight = np.ones(hands.shape[1])
     weight[list(key_steps)] = KEY_STEP_WEIGHT
     candidates = Candidates.of(things, scene)
-    errors = prediction_errors(candidates, hands)
+    errors = prediction_errors(candidates, hands, second)
     if len(hands) >= DEMOS_TO_TELL_THINGS:
-        candidates = _with_fitted_lines(candidates, errors, hands, weight)
-        errors = prediction_errors(candidates, hands)
+        candidates = _with_fitted_lines(candidates, errors, hands, weight, second)
+        errors = prediction_errors(candidates, hands, second)
         if errors.mean_squared[list(key_steps)].min(axis=(1, 2)).max() > UNEXPLAINED_M**2:
             candidates = candidates.with_more_origins(things)
-            errors = prediction_errors(candidates, hands)
+            errors = prediction_errors(candidates, hands, second)
     chosen = _viterbi(errors.cost.reshape(len(weight), -1) * weight[:, None])
     picks = [np.unravel_index(index, errors.cost.shape[1:]) for index in chosen]
-    return _fitted(candidates, errors, hands, [(int(m), int(n)) for m, n in picks])
+    return _fitted(candidates, errors, hands, second, [(int(m), int(n)) for m, n in picks])
 
 
 def _viterbi(cost: FloatArray) -> list[int]:
@@ -257,7 +285,9 @@ def _viterbi(cost: FloatArray) -> list[int]:
     return chosen[::-1]
 
 
-def _with_fitted_lines(candidates: Candidates, errors: Errors, hands: FloatArray, weight: FloatArray) -> Candidates:
+def _with_fitted_lines(
+    candidates: Candidates, errors: Errors, hands: FloatArray, weight: FloatArray, second: NDArray[np.bool_] | None
+) -> Candidates:
     """``candidates`` with those lines fitted that suit some step best."""
     best = errors.cost.reshape(len(weight), -1).argmin(axis=1)
     picks = np.stack(np.unravel_index(best, errors.cost.shape[1:]), axis=1)
@@ -265,12 +295,17 @@ def _with_fitted_lines(candidates: Candidates, errors: Errors, hands: FloatArray
     for index in np.unique(picks[:, 0]):
         if len(axes[index].ends) == 2:
             steps = np.flatnonzero(picks[:, 0] == index)
-            axes[index] = _fitted_line(candidates, int(index), hands[:, steps], picks[steps, 1], weight[steps])
+            axes[index] = _fitted_line(candidates, int(index), hands[:, steps], picks[steps, 1], weight[steps], second)
     return replace(candidates, axes=tuple(axes))
 
 
 def _fitted_line(
-    candidates: Candidates, index: int, hands: FloatArray, origins: FloatArray, weight: FloatArray
+    candidates: Candidates,
+    index: int,
+    hands: FloatArray,
+    origins: FloatArray,
+    weight: FloatArray,
+    second: NDArray[np.bool_] | None,
 ) -> Axes:
     """Axes ``index`` with the ends between which the line predicts the ``hands (I, T, 3, 3)`` best, each step's origin
     being one of ``origins (T,)``; by robust least squares, with the other numbers eliminated."""
@@ -292,8 +327,8 @@ def _fitted_line(
         line = replace(candidates, axes=(moved(x),))
         rotation = line.rotations()[0]
         shape = np.einsum("iyx,itpy->tipx", rotation, hands - centre[:, :, None])
-        parts = [(shape - shape.mean(axis=1, keepdims=True)).transpose(1, 2, 3, 0).reshape(-1, len(weight)) * 0.6]
-        start, (design, penalty) = line.start(home), line.design(home)
+        parts = [_from_mean(shape, second) * 0.6]
+        start, (design, penalty) = line.start(home), line.design(home, second)
         for number, origin in enumerate(origins):
             flat = design[0, origin].reshape(-1, len(penalty))
             target = (centre[:, number] - start[origin]).ravel()
@@ -305,11 +340,17 @@ def _fitted_line(
     return moved(fit.x)
 
 
-def _fitted(candidates: Candidates, errors: Errors, hands: FloatArray, picks: Sequence[tuple[int, int]]) -> list[Frame]:
+def _fitted(
+    candidates: Candidates,
+    errors: Errors,
+    hands: FloatArray,
+    second: NDArray[np.bool_] | None,
+    picks: Sequence[tuple[int, int]],
+) -> list[Frame]:
     """The frames of ``picks`` (axes, origin), one a step, with their numbers fitted robustly to the demonstrations."""
     centre = hands.mean(axis=2)
     home = centre[:, 0].mean(axis=0)
-    start, (design, penalty) = candidates.start(home), candidates.design(home)
+    start, (design, penalty) = candidates.start(home), candidates.design(home, second)
     frames = []
     for step, (m, n) in enumerate(picks):
         origin, x = candidates.origins[n], design[m, n]
@@ -321,7 +362,7 @@ def _fitted(candidates: Candidates, errors: Errors, hands: FloatArray, picks: Se
             squared = ((x @ found - target) ** 2).sum(axis=1)
             weight = 1 / (1 + squared / max(float(np.median(squared)), NOISE_M**2) / 3)
         w = np.zeros(GROWTH.start + 3 * len(candidates.growing))
-        w[candidates.numbers] = found
+        w[candidates.numbers] = found[: len(candidates.numbers)]
         shares = w[SHARES].reshape(2, 3)[: len(origin.ends) - 1]
         frames.append(
             Frame(

@@ -86,19 +86,19 @@ class Frame:
     error: float = float("nan")
 
     def __str__(self) -> str:
+        return self.words_from(self)
+
+    def words_from(self, first: Frame) -> str:
+        """In words, with shares from those of ``first``, which it continues, to its own."""
         if self.things == (WORLD,):
             return "world"
-        origin = f"{self.way} of the way from {self.ends[0]} to {self.ends[1]}" if self.shares else str(self.ends[0])
-        if len(self.ends) == 3:
-            first, second = map(_percent, self.shares)
-            origin = f"{first} of the way from {self.ends[0]} to {self.ends[1]} and {second} to {self.ends[2]}"
+        start, *further = self.ends
+        ways = [
+            f"{_percent(low, high)} of the way{after} to {end}"
+            for low, high, end, after in zip(first.shares, self.shares, further, (f" from {start}", ""), strict=False)
+        ]
         grows = "".join(f", further with the size of {thing}" for thing, _ in self.growth)
-        return f"{origin}, {self.axes}{grows}"
-
-    @property
-    def way(self) -> str:
-        """The shares in words."""
-        return " and ".join(map(_percent, self.shares))
+        return f"{' and '.join(ways) or start}, {self.axes}{grows}"
 
     @property
     def things(self) -> tuple[Thing, ...]:
@@ -134,7 +134,9 @@ class Frame:
 WORLD_FRAME = Frame(Axes((Anchor(WORLD, np.zeros(3)),)), (WORLD,), (np.zeros(3),))
 
 
-def _percent(share: FloatArray) -> str:
-    if np.ptp(share) == 0:
-        return f"{share[0]:z.0%}"
-    return ", ".join(f"{axis} {own:z.0%}" for axis, own in zip("xyz", share, strict=True))
+def _percent(low: FloatArray, high: FloatArray) -> str:
+    """Shares ``(3,)`` in words, once where all axes have the same."""
+    spans = [" to ".join(dict.fromkeys(f"{end:z.0%}" for end in ends)) for ends in zip(low, high, strict=True)]
+    if len(set(spans)) == 1:
+        return spans[0]
+    return ", ".join(f"{axis} {span}" for axis, span in zip("xyz", spans, strict=True))

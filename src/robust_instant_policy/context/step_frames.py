@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robust_instant_policy.context.choice import choose_frames
 from robust_instant_policy.context.codec import MM
@@ -43,12 +44,14 @@ class StepFrames:
         key_steps: Sequence[int],
         things: Sequence[Thing],
         ranking: Ranking | None = None,
+        second: NDArray[np.bool_] | None = None,
     ) -> StepFrames:
         """The frames in which demonstrations with ``keypoints (I, K, 3)``, named by ``ranking``, and aligned ``actions
-        (I, T, 10·A)`` predict each other best; ``key_steps`` count more (see `choose_frames`)."""
+        (I, T, 10·A)`` predict each other best; ``key_steps`` count more, and those of a ``second (I,)`` way may do
+        something else in the same frames (see `choose_frames`)."""
         scene, hands = locate([WORLD, *things], keypoints), hands_of(actions)
         arms = [hands[:, :, arm] for arm in range(hands.shape[2])]
-        frames = tuple(tuple(choose_frames(things, scene, own, key_steps)) for own in arms)
+        frames = tuple(tuple(choose_frames(things, scene, own, key_steps, second)) for own in arms)
         return cls(frames, ranking, tuple(map(shown_jumps, arms)))
 
     @property
@@ -67,8 +70,7 @@ class StepFrames:
         for arm, own in enumerate(self.arms):
             changes = [step for step in range(1, len(own)) if not own[step].continues(own[step - 1])]
             for start, stop in pairwise([0, *changes, len(own)]):
-                first, last = own[start], own[stop - 1]
-                words = str(last) if first.way == last.way else f"{first.way} to {last}"
+                words = own[stop - 1].words_from(own[start])
                 found.append((words, arm, start, stop - 1, poses[stop - 1, arm]))
         return found
 

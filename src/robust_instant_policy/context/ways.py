@@ -21,7 +21,9 @@ from robust_instant_policy.context.things import MAX_THINGS, WORLD, Located, Sce
 from robust_instant_policy.geometry import FloatArray, fit_upright
 
 RANK_GAIN, SPLIT_GAIN = 1.0, 1.0  # sums of logarithms of the errors at key steps by which an explanation must be better
+MAX_SPLITS = 40  # ways to part the demonstrations that are tried, those with the widest gaps
 LEAST_OF_A_WAY = 2  # demonstrations
+FEW_OF_A_WAY = 4  # demonstrations up to which a way may have to share the frames of the other
 ALIKE_M = 0.006  # largest difference of the shapes of things that are alike
 
 
@@ -127,9 +129,11 @@ def find_ranking(keypoints: FloatArray, hands: FloatArray) -> Ranking | None:
     return best
 
 
-def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tuple[Split, np.ndarray] | None:
-    """What parts demonstrations in ``scene`` with ``hands (I, T, A, 3, 3)`` at the key steps, and which side ``(I,)``
-    each is on (True: the second); None where one way explains them as well.
+def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tuple[Split, np.ndarray, bool] | None:
+    """What parts demonstrations in ``scene`` with ``hands (I, T, A, 3, 3)`` at the key steps, which side ``(I,)`` each
+    is on (True: the second), and whether both sides share their frames; None where one way explains them as well.
+
+    A side of few demonstrations may share the frames of the other and differ by an offset and a turn in them.
 
     Of several measures that part them alike, the one with the widest gap decides. Measures of other things than those
     to which the hand moves, at the step that one way explains worst, need a wider one.
@@ -138,7 +142,10 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
     single = _squared(things, scene, hands)
     if demos < 2 * LEAST_OF_A_WAY or single.max() < UNEXPLAINED_M**2:
         return None
-    one_way = _cost(np.minimum(single, _least(_errors(things, scene, hands, more_origins=True)[1])))
+    best_single = np.minimum(single, _least(_errors(things, scene, hands, more_origins=True)[1]))
+    if best_single.max() < UNEXPLAINED_M**2:
+        return None
+    one_way = _cost(best_single)
     arm, step = np.unravel_index(int(single.argmax()), single.shape)
     splits: dict[bytes, list[tuple[Split, np.ndarray, float]]] = {}
     for measure, threshold, gap in _cuts(things, scene):
@@ -148,23 +155,38 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
         if enough and min(gap, deviation / 4) > NOISE_M:
             key = (side if side[0] else ~side).tobytes()
             splits.setdefault(key, []).append((Split(measure, threshold, gap), side, gap / deviation))
-    best: tuple[float, Split, np.ndarray] | None = None
-    for same in splits.values():
-        squared, used = np.zeros_like(single), set[tuple[int, ...]]()
-        for part in (~same[0][1], same[0][1]):
-            own = {thing: located.of(part) for thing, located in scene.items()}
-            candidates, errors = _errors(things, own, hands[part])
-            squared += part.mean() * _least(errors)
-            used.add(candidates.nearest(errors[arm][step]))
+    best: tuple[float, Split, np.ndarray, bool] | None = None
+    by_gap = sorted(splits.values(), key=lambda same: -max(gap for _, _, gap in same))
+    for same in by_gap[:MAX_SPLITS]:
+        side = same[0][1]
+        few = min(side.sum(), demos - side.sum()) <= FEW_OF_A_WAY
+        for shared in (False, True) if few else (False,):
+            squared, used = _parted(things, scene, hands, side, shared, int(arm), int(step))
             if squared.max() >= single.max() / 4:
-                break
-        else:
+                continue
             margins = [gap / np.sqrt(1 + len(split.measure.members ^ used)) for split, _, gap in same]
             widest = int(np.argmax(margins))
             cost = _cost(squared) - min(margins[widest], 1.0)
             if best is None or cost < best[0]:
-                best = cost, same[widest][0], same[widest][1]
-    return (best[1], best[2]) if best is not None and best[0] + SPLIT_GAIN < one_way else None
+                best = cost, *same[widest][:2], shared
+    return best[1:] if best is not None and best[0] + SPLIT_GAIN < one_way else None
+
+
+def _parted(
+    things: Sequence[Thing], scene: Scene, hands: FloatArray, side: np.ndarray, shared: bool, arm: int, step: int
+) -> tuple[FloatArray, set[tuple[int, ...]]]:
+    """Mean squared errors ``(A, T)``, square metres, where demonstrations on either ``side`` are predicted from those
+    of the same alone, in frames of their own or ``shared`` ones; and the things to which an arm moves at a step."""
+    if shared:
+        candidates, errors = _errors(things, scene, hands, second=side)
+        return _least(errors), {candidates.nearest(errors[arm][step])}
+    squared, used = np.zeros((hands.shape[2], hands.shape[1])), set[tuple[int, ...]]()
+    for part in (~side, side):
+        own = {thing: located.of(part) for thing, located in scene.items()}
+        candidates, errors = _errors(things, own, hands[part])
+        squared += part.mean() * _least(errors)
+        used.add(candidates.nearest(errors[arm][step]))
+    return squared, used
 
 
 def _squared(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> FloatArray:
@@ -173,13 +195,18 @@ def _squared(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> FloatA
 
 
 def _errors(
-    things: Sequence[Thing], scene: Scene, hands: FloatArray, more_origins: bool = False
+    things: Sequence[Thing],
+    scene: Scene,
+    hands: FloatArray,
+    more_origins: bool = False,
+    second: np.ndarray | None = None,
 ) -> tuple[Candidates, list[FloatArray]]:
     """The candidates, and their mean squared errors ``(T, M, N)`` for each arm."""
     candidates = Candidates.of(things, scene)
     if more_origins:
         candidates = candidates.with_more_origins(things)
-    return candidates, [prediction_errors(candidates, hands[:, :, arm]).mean_squared for arm in range(hands.shape[2])]
+    arms = [hands[:, :, arm] for arm in range(hands.shape[2])]
+    return candidates, [prediction_errors(candidates, own, second).mean_squared for own in arms]
 
 
 def _least(errors: Sequence[FloatArray]) -> FloatArray:

@@ -103,12 +103,14 @@ def _adaptive(keypoints: FloatArray, aligned: AlignedDemonstrations, order: Orde
     named = keypoints if ranking is None else ranking.renamed(keypoints)
     things = find_things(named)
     found = find_split(things, locate([WORLD, *things], named), hands)
-    sides = [np.ones(len(named), dtype=bool)] if found is None else [~found[1], found[1]]
+    every = np.ones(len(named), dtype=bool)
+    sides = [every] if found is None else [~found[1], found[1]]
+    shared = found is not None and found[2]
     ways = []
     for side in sides:
-        shown = np.flatnonzero(side)
-        chosen = StepFrames.adaptive(named[shown], aligned.actions[shown], aligned.key_steps, things, ranking)
-        ways.append(_factorised(chosen, keypoints, aligned, shown, True, order))
+        among, second = (every, found[1]) if found is not None and shared else (side, None)
+        frames = StepFrames.adaptive(named[among], aligned.actions[among], aligned.key_steps, things, ranking, second)
+        ways.append(_factorised(frames, keypoints, aligned, np.flatnonzero(side), True, order))
     if found is None:
         return ways[0]
     most = max(ways, key=lambda way: len(way.shown))

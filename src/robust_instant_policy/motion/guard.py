@@ -196,12 +196,22 @@ def joint_motion(start: FloatArray, goal: FloatArray, fingers: FloatArray, arms:
     return Motion(joints, np.tile(fingers, count), poses, np.tile(fingers <= 0.0, count))
 
 
+def check_home(arms: Sequence[Arm], limits: Limits, rate_hz: float) -> None:
+    """Refuse homes in which a link is at the table, or two arms are together."""
+    try:
+        Space(arms, limits).check(np.stack([arm.home for arm in arms])[None], rate_hz, to_home=True)
+    except UnreachableError as refused:
+        words = f"the park pose is refused ({refused}); change park, or base, in the cell's file"
+        raise UnreachableError(words) from None
+
+
 def park_motion(start: FloatArray, fingers: FloatArray, arms: Sequence[Arm], limits: Limits, rate_hz: float,
                 speed: float = 1.0) -> Motion:  # fmt: skip
     """Motion from joints ``start (A, J)`` to the arms' homes: directly, or up first where that would be refused.
 
     Fingers keep their travel ``fingers (A,)``. Raises `UnreachableError` where both ways are refused.
     """
+    check_home(arms, limits, rate_hz)
     home = np.stack([arm.home for arm in arms])
     direct = retimed(joint_motion(start, home, fingers, arms, rate_hz), arms, rate_hz, speed)
     try:

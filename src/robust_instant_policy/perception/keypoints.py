@@ -29,7 +29,7 @@ from robust_instant_policy.perception.objects import (
     without,
 )
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
-from robust_instant_policy.perception.relevance import MIN_RELEVANCE, hand_places, relevances, shares, still
+from robust_instant_policy.perception.relevance import hand_places, relevances, shares, still
 from robust_instant_policy.perception.selection import best_buddies, select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
 from robust_instant_policy.perception.view import Hands, View, make_view
@@ -229,7 +229,6 @@ def _weights(
     ]
     if trajectories is not None:
         relevant = relevances(places, trajectories)
-        relevant[relevant < MIN_RELEVANCE * relevant.max()] = 0
         if relevant.any():
             return relevant
     sizes = np.array([len(points[0]) for points in places], dtype=np.float64)

@@ -15,7 +15,7 @@ CONTACT_M = 0.05  # distance of the fingertips at which an object counts 1/e
 RELATED_M = 0.20  # the same for an object relative to which they move
 MIN_SPREAD_M = 0.01  # of the hand's places over demonstrations; less tells nothing of what they depend on
 CLOSED = 0.5  # gripper state
-MIN_RELEVANCE = 0.2  # of the most relevant object's
+MIN_RELEVANCE = 0.2  # of the most relevant object's, or, of the most relevant one at an event, of the greatest possible
 STILL_M = 0.010  # by which scenery seems to move between images
 
 
@@ -23,12 +23,16 @@ def relevances(objects: Sequence[Sequence[FloatArray]], trajectories: Sequence[T
     """Relevance ``(O,)`` of ``objects``, each given by its points ``(N, 3)`` in every demonstration, metres, world.
 
     Over the hand's events (`_events`) the sum of its nearness to the object or, if that is more, of the share of the
-    variance of the hand's place that the object's place explains.
+    variance of the hand's place that the object's place explains. It is 0 for an object that is neither the most
+    relevant one at an event nor of `MIN_RELEVANCE` in all.
     """
     scenes = zip(*objects, strict=True)
     events = [_events(points, path) for points, path in zip(scenes, trajectories, strict=True)]
     hands = _corresponding(events)
-    return np.array([_relevance(points, hands) for points in objects])
+    of_events = np.array([_relevances(points, hands) for points in objects])
+    total = of_events.sum(axis=1)
+    most_at_an_event = ((of_events == of_events.max(axis=0)) & (of_events >= MIN_RELEVANCE)).any(axis=1)
+    return np.where(most_at_an_event | (total >= MIN_RELEVANCE * total.max()), total, 0)
 
 
 def hand_places(views: Sequence[View], trajectories: Sequence[Trajectory]) -> FloatArray:
@@ -79,8 +83,8 @@ def _events(points: Sequence[FloatArray], path: Trajectory) -> FloatArray:
     return np.array(places)
 
 
-def _relevance(points: Sequence[FloatArray], hands: FloatArray) -> float:
-    """Of an object with ``points (N, 3)`` in each of I demonstrations, for the hand's places ``hands (I, E, 3)``."""
+def _relevances(points: Sequence[FloatArray], hands: FloatArray) -> FloatArray:
+    """``(E,)`` of an object with ``points (N, 3)`` in each of I demonstrations, for the hand's ``hands (I, E, 3)``."""
     centres = np.array([one.mean(axis=0) for one in points])
     distances = np.array([cKDTree(one).query(at)[0] for one, at in zip(points, hands, strict=True)])
     near = np.exp(-((distances / CONTACT_M) ** 2)).mean(axis=0)  # what only some demonstrations grasp matters, too
@@ -89,4 +93,4 @@ def _relevance(points: Sequence[FloatArray], hands: FloatArray) -> float:
     left = (hands - centres[:, None]).var(axis=0).sum(axis=-1)
     explained = np.where(spread > MIN_SPREAD_M**2, 1 - left / np.maximum(spread, MIN_SPREAD_M**2), 0)
     related = np.clip(explained, 0, 1) * np.exp(-((distance / RELATED_M) ** 2))
-    return float(np.maximum(near, related).sum())
+    return np.maximum(near, related)

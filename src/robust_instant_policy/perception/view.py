@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_dilation, distance_transform_edt, uniform_filter
+from scipy.ndimage import binary_dilation, binary_fill_holes, distance_transform_edt, uniform_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -57,6 +57,7 @@ MIN_TILT_RAD = np.deg2rad(1.0)  # of the table in the world; less is the noise o
 BORDER_SHARE = 0.01  # of the image's width and height, at its border
 HOVERING_M = 0.06  # above the table where it crosses the image's border: an arm or a person
 TALLEST_M = 0.8  # of what stands on a table
+DEEPEST_M = 0.3  # of a hole in a table: what is lower is the floor under it
 
 HAND_SHARE = 0.5  # of the distance from the gripper point to the fingertips: what is nearer to it is the hand
 TOLD_BORDER_SHARE = 0.01  # of the image, that something at its border covers
@@ -140,13 +141,14 @@ class View:
     notes: tuple[str, ...]
 
     def hides(self, points: FloatArray) -> NDArray[np.bool_]:
-        """Which of ``points (..., 3)``, metres, world, lie behind a surface that the image shows."""
+        """Which of ``points (..., 3)``, metres, world, lie in the image, behind a surface that it shows."""
         camera = self.observation
         pixels = np.rint(project(points, camera.intrinsics, camera.camera_pose))
         height, width = self.depth.shape
         u, v = (pixels[..., axis].clip(0, size - 1).astype(np.intp) for axis, size in enumerate((width, height)))
+        inside = (pixels[..., 0] == u) & (pixels[..., 1] == v)
         axis = camera.camera_pose[:3, 2]
-        return (points - camera.camera_pose[:3, 3]) @ axis - self.depth[v, u] > HIDDEN_M
+        return inside & ((points - camera.camera_pose[:3, 3]) @ axis - self.depth[v, u] > HIDDEN_M)
 
     @property
     def shows_hand(self) -> bool:
@@ -184,10 +186,11 @@ def make_view(
 ) -> View:
     """Describe and segment an image.
 
-    A point is foreground by its height above the table, or, when flat, by the network's saliency and a colour that
-    differs from the table's. What is below or beside the table, outside ``workspace (2, 3)`` (metres, world; its lower
-    z is ignored), or reaches in over the border is not, nor is a piece that holds a part of ``hands``. Raises
-    `KeypointError` for intrinsics of another resolution, and for too few depth readings or foreground points.
+    A point is foreground by its height above the table, in a hole of the table, or, when flat, by the network's
+    saliency and a colour that differs from the table's. What is under or beside the table, outside ``workspace (2, 3)``
+    (metres, world; its lower z is ignored), or reaches in over the border is not, nor is a piece that holds a part of
+    ``hands``. Raises `KeypointError` for intrinsics of another resolution, and for too few depth readings
+    or foreground points.
     """
     _check_resolution(observation)
     depth, note = in_metres(observation.depth)
@@ -212,8 +215,10 @@ def make_view(
     descriptors = network.describe(observation.rgb)
     label = np.full(len(points), TABLE)
     label[_unlike_table(observation, descriptors, pixels, heights, table, network.salient)] = 0
-    label[heights < -table.least_height] = BELOW
-    standing = np.flatnonzero(label == 0)
+    within_table = _within_table(np.abs(heights) <= table.least_height, usable)
+    lower = heights < -table.least_height
+    label[lower] = np.where(within_table & (heights > -DEEPEST_M), 0, BELOW)[lower]
+    standing = np.flatnonzero((label == 0) & ~within_table)
     label[standing[table.beside(points[standing])]] = BESIDE
     label[(label == 0) & (heights > TALLEST_M)] = HIGH
     label[~inside | ((label == 0) & (points[:, 2] > upper[2]))] = OUTSIDE
@@ -275,6 +280,15 @@ def make_view(
         least,
         notes,
     )
+
+
+def _within_table(on_table: NDArray[np.bool_], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the points ``(N,)`` of the ``usable (h, w)`` pixels lie where the image shows the table all around: what
+    is lower than the table there is in a hole of it.
+    """
+    shown = np.zeros(usable.shape, dtype=bool)
+    shown[usable] = on_table
+    return binary_fill_holes(binary_dilation(shown))[usable]
 
 
 def subsample(indices: IntArray, count: int, seed: int) -> IntArray:

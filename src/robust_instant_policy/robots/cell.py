@@ -9,6 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,6 +36,10 @@ from robust_instant_policy.motion.limits import (
 
 CELLS = Path(__file__).with_name("cells")  # those that come with the package: emulated ones
 MIN_CONFIDENCE = 0.9  # of a plan; below it `rip run` refuses (docs/trust.md)
+FAR_M = 5.0  # from the world's origin; more is a length in millimetres
+SPEEDS = {"joint_speed": 2 * math.pi, "joint_acceleration": 100.0, "tool_speed": 2.0}  # rad/s, rad/s², m/s at most
+PACES = 0.1, 1000.0
+PORTS = ("port", "address", "device")  # keys by which a driver or leader finds its device
 FIRST_RUN_SPEED = 0.25  # share of the usual speed, until a first run in a cell has ended well
 
 
@@ -58,10 +64,11 @@ class Section:
             raise self.error(key, f"must be a number from {least:g} to {most:g}, not {value!r}")
         return float(value)
 
-    def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
+    def whole(self, key: str, default: int | None = None, least: int = 0, most: float = math.inf) -> int:
         value = self._take(key, default)
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise self.error(key, f"must be a whole number of at least {least}, not {value!r}")
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            words = f"of at least {least}" if math.isinf(most) else f"from {least} to {most:g}"
+            raise self.error(key, f"must be a whole number {words}, not {value!r}")
         return value
 
     def flag(self, key: str, default: bool | None = None) -> bool:
@@ -86,17 +93,42 @@ class Section:
         array.flags.writeable = False
         return array
 
+    def pose(self, key: str) -> FloatArray:
+        """A pose ``(4, 4)``, metres: a rotation and a position that is not far away."""
+        pose = self.array(key, (4, 4))
+        turn = pose[:3, :3]
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
+            raise self.error(key, "must be a pose: its first three columns are no right-handed rotation")
+        if not np.allclose(pose[3], [0, 0, 0, 1]):
+            raise self.error(key, "must be a pose with the last row 0, 0, 0, 1; was it transposed?")
+        self._near(key, pose[:3, 3])
+        return pose
+
+    def _near(self, key: str, metres: FloatArray) -> None:
+        if np.abs(metres).max() > FAR_M:
+            raise self.error(key, f"must be in metres: {np.abs(metres).max():g} is more than {FAR_M:g} m")
+
+    def box(self, key: str) -> FloatArray:
+        """The lower and the upper corner ``(2, 3)`` of a box, metres, that is not below the table."""
+        box = self.array(key, (2, 3))
+        if not (box[0] < box[1]).all():
+            raise self.error(key, "must be the lower and then the upper corner, [[x, y, z], [x, y, z]] in metres")
+        self._near(key, box)
+        if box[1, 2] <= 0:
+            raise self.error(key, "must reach above the table, whose z is 0")
+        return box
+
     def section(self, key: str, default: Mapping[str, Any] | None = None) -> Section:
         value = self._take(key, default)
         if not isinstance(value, Mapping):
             raise self.error(key, f"must be a table, not {value!r}")
-        return Section(value, f"{self._where} {key}".strip())
+        return Section(value, f"{self._where}: {key}")
 
     def sections(self, key: str) -> list[Section]:
         value = self._take(key, None)
         if not isinstance(value, list) or not value or not all(isinstance(one, Mapping) for one in value):
             raise self.error(key, f"must be one or more tables [[{key}]]")
-        return [Section(one, f"{self._where} {key}[{index}]".strip()) for index, one in enumerate(value)]
+        return [Section(one, f"{self._where}: {key}[{index}]") for index, one in enumerate(value)]
 
     def rest(self) -> Mapping[str, Any]:
         """What was not taken yet, for a driver that reads it as a `Section` of its own."""
@@ -224,10 +256,14 @@ class CellConfig:
                 camera_pose = read_camera_pose(calibration) if calibration.exists() else None
             camera = DeviceConfig.read(section, f"{path}: camera")
         emulation = root.section("emulation").rest() if "emulation" in root else None
+        if emulation is None:
+            _check_ports(arms, path)
+        else:
+            Section(emulation, f"{path}: emulation").number("pace", 1.0, *PACES)
         config = cls(
             path=path,
-            name=cell.text("name", path.stem),
-            rate_hz=cell.number("rate_hz", 50.0, 5.0, 1000.0),
+            name=_name(cell, path.stem),
+            rate_hz=cell.number("rate_hz", 50.0, 20.0, 500.0),  # servos and controllers stop after 100 ms of silence
             execute_hz=cell.number("execute_hz", 1.0, 0.1, 50.0),
             limits=_limits(cell),
             min_confidence=cell.number("min_confidence", MIN_CONFIDENCE, 0.0, 1.0),
@@ -246,7 +282,7 @@ class CellConfig:
 def read_section(path: Path) -> Section:
     """A TOML file as a `Section`. Raises `CellError` for one that is missing or is not TOML."""
     try:
-        return Section(tomllib.loads(read_regular(path).decode()), f"{path}:")
+        return Section(tomllib.loads(read_regular(path).decode()), f"{path}")
     except FileNotFoundError:
         raise CellError(f"no file at {path}; docs/robots.md shows how to write one") from None
     except (DatasetError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -255,7 +291,11 @@ def read_section(path: Path) -> Section:
 
 def read_camera_pose(path: Path) -> FloatArray:
     """``pose (4, 4)``, camera to world, of a calibration file; other keys are the calibration's own."""
-    return read_section(path).array("pose", (4, 4))
+    section = read_section(path)
+    pose = section.pose("pose")
+    if pose[2, 3] < 0:
+        raise section.error("pose", f"must not be below the table, whose z is 0, but is at z = {pose[2, 3]:g}")
+    return pose
 
 
 def read_gripper(path: Path) -> GripperTriangle:
@@ -266,7 +306,7 @@ def read_gripper(path: Path) -> GripperTriangle:
 def read_tool(path: Path) -> FloatArray | None:
     """``tool (4, 4)`` of a gripper's file, measured tool -> tool of the arm's model; None without it."""
     section = read_section(path)
-    return section.array("tool", (4, 4)) if "tool" in section else None
+    return section.pose("tool") if "tool" in section else None
 
 
 def _gripper(section: Section) -> GripperTriangle:
@@ -276,23 +316,43 @@ def _gripper(section: Section) -> GripperTriangle:
 
 
 def _limits(cell: Section) -> Limits:
-    workspace = cell.array("workspace", (2, 3))
-    if not (workspace[0] < workspace[1]).all():
-        raise cell.error("workspace", "must be the lower and then the upper corner, [[x, y, z], [x, y, z]] in metres")
     return Limits(
-        workspace,
+        cell.box("workspace"),
         table_depth=cell.number("table_depth", TABLE_TOLERANCE_M, 0.0, 0.05),
         arm_distance=cell.number("arm_distance", ARM_DISTANCE_M, 0.0, 1.0),
-        link_distance=cell.number("link_distance", LINK_DISTANCE_M, 0.0, 1.0),
+        link_distance=cell.number("link_distance", LINK_DISTANCE_M, -0.05, 1.0),
         turn_per_step=math.radians(cell.number("turn_per_step", math.degrees(TURN_PER_STEP_RAD), 1.0, 180.0)),
         step=cell.number("step", STEP_M, 0.01, 2.0),
         following_error=cell.number("following_error", FOLLOWING_ERROR_RAD, 0.01, 2.0),
     )
 
 
+def _name(section: Section, default: str | None = None) -> str:
+    """A name that may stand in a file's name and in an address."""
+    name = section.text("name", default)
+    if not re.fullmatch(r"\w[\w.-]*", name):
+        raise section.error("name", f"must be letters, digits, _, . and -, not {name!r}")
+    return name
+
+
+def _check_ports(arms: Sequence[ArmConfig], path: Path) -> None:
+    """Raises `CellError` for two devices at one port: a leader would be moved, or one arm by two commands."""
+    used: dict[str, str] = {}
+    for arm in arms:
+        for what, device in (("driver", arm.driver), ("leader", arm.leader)):
+            for port in (str(device.options[key]) for key in PORTS if device is not None and key in device.options):
+                port = os.path.realpath(port) if port.startswith("/") else port  # a device has several names
+                who = f"the {what} of {arm.name}"
+                if port in used:
+                    raise CellError(f"{path}: {used[port]} and {who} have the same port {port!r}")
+                used[port] = who
+
+
 def _arm(section: Section, path: Path) -> ArmConfig:
-    name = section.text("name")
+    name = _name(section)
     base = section.array("base", (6,), [0.0] * 6)
+    if np.abs(base[:3]).max() > FAR_M:
+        raise section.error("base", f"must begin with x, y, z in metres, not {base[:3].tolist()}")
     gripper = tool = None
     if "gripper" in section:
         file = path.parent / section.text("gripper")
@@ -313,11 +373,7 @@ def _arm(section: Section, path: Path) -> ArmConfig:
         leader=DeviceConfig.read(section.section("leader"), f"{path}: leader of {name}")
         if "leader" in section
         else None,
-        **{key: _optional(section, key) for key in ("joint_speed", "joint_acceleration", "tool_speed")},
+        **{key: section.number(key, least=1e-3, most=most) if key in section else None for key, most in SPEEDS.items()},
     )
     section.finish()
     return config
-
-
-def _optional(section: Section, key: str) -> float | None:
-    return section.number(key, least=1e-3, most=100.0) if key in section else None

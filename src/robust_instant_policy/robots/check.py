@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
 from robust_instant_policy.errors import RipError, RobotError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.motion.arm import Arm
+from robust_instant_policy.motion.guard import check_home
+from robust_instant_policy.motion.state import ArmState
 from robust_instant_policy.robots.calibration import check_camera
 from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cameras import make_camera
-from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.cell import ArmConfig, CellConfig
 from robust_instant_policy.robots.execution import MIN_DEPTH_SHARE
+from robust_instant_policy.robots.follower import Follower
+from robust_instant_policy.robots.leaders import make_leader
+from robust_instant_policy.robots.priority import CONTROL, real_time
 from robust_instant_policy.robots.station import START_RAD, Station
 
+T = TypeVar("T")
 READINGS = 100
 FRAMES = 3
 JITTER_S = 5e-3  # largest accepted difference from the rate, of 95% of the readings
@@ -23,10 +32,17 @@ JITTER_S = 5e-3  # largest accepted difference from the rate, of 95% of the read
 
 def check_cell(config: CellConfig, say: Callable[[str], object]) -> int:
     """Print one line for each device and finding; returns the exit status, 1 if something must be mended."""
+    station = Station(config)
+    checks: list[Callable[[], list[tuple[str, bool]]]] = [partial(_park_poses, station)]
+    for one, arm, follower in zip(config.arms, station.arms, station.followers, strict=True):
+        checks.append(partial(_arm, arm, follower, config.rate_hz))
+        if one.leader is not None:
+            checks.append(partial(_leader, one, arm, config))
+    checks.append(partial(_camera, config))
     bad = 0
-    for check in (_arms, _camera):
+    for check in checks:
         try:
-            for line, good in check(config):
+            for line, good in check():
                 say(f"  {'ok   ' if good else 'WRONG'} {line}")
                 bad += not good
         except RipError as error:
@@ -36,29 +52,58 @@ def check_cell(config: CellConfig, say: Callable[[str], object]) -> int:
     return int(bad > 0)
 
 
-def _arms(config: CellConfig) -> list[tuple[str, bool]]:
-    lines = []
-    with Station(config) as station:
-        for arm, follower in zip(station.arms, station.followers, strict=True):
-            seconds, clocks = [], []
-            for _ in range(READINGS):
-                start = time.monotonic()
-                state = follower.state()
-                seconds.append(time.monotonic() - start)
-                clocks.append(state.clock)
-                time.sleep(max(0.0, 1 / config.rate_hz - seconds[-1]))
-            slow = float(np.percentile(seconds, 95))
-            lines.append((_timing(arm.name, slow, config.rate_hz), slow + JITTER_S < 1 / config.rate_hz))
-            lines.append((f"{arm.name}: its clock advances", len(set(clocks)) > READINGS // 2))
-            lines += [(f"{arm.name}: {fault}", False) for fault in state.faults]
-            lines.append(_at_park(arm.name, state.joints, arm.home))
-    return lines
+def _park_poses(station: Station) -> list[tuple[str, bool]]:
+    check_home(station.arms, station.config.limits, station.rate_hz)
+    return []
 
 
-def _timing(name: str, slow: float, rate_hz: float) -> str:
-    return f"{name}: 95% of the states within {1e3 * slow:.1f} ms, a control step has {1e3 / rate_hz:.0f} ms" + (
-        "" if slow + JITTER_S < 1 / rate_hz else "; set the adapter's latency timer to 1 ms, or lower rate_hz"
-    )
+def _arm(arm: Arm, follower: Follower, rate_hz: float) -> list[tuple[str, bool]]:
+    follower.connect()
+    try:
+        states, at, seconds = _readings(follower.state, rate_hz)
+    finally:
+        follower.disconnect()
+    clocks = [state.clock for state in states]
+    return [
+        _timing(f"{arm.name}: 95% of the states", seconds, rate_hz),
+        (
+            f"{arm.name}: its clock advances by {(clocks[-1] - clocks[0]) / (at[-1] - at[0]):.2f} s a second",
+            len(set(clocks)) > READINGS // 2,
+        ),
+        *((f"{arm.name}: {fault}", False) for fault in states[-1].faults),
+        _at_park(arm.name, states[-1].joints, arm.home),
+    ]
+
+
+def _leader(config: ArmConfig, arm: Arm, cell: CellConfig) -> list[tuple[str, bool]]:
+    leader = make_leader(config, arm, cell.rate_hz, cell.path.parent, lambda keys: "")
+    parked = ArmState(arm.home, np.zeros_like(arm.home), arm.finger_travel, 0.0, 0.0)
+    leader.connect()
+    try:
+        leader.start()
+        _, _, seconds = _readings(lambda: leader.read(parked), cell.rate_hz)
+    finally:
+        leader.disconnect()
+    return [_timing(f"{leader.name}: 95% of the readings", seconds, cell.rate_hz)]
+
+
+def _readings(read: Callable[[], T], rate_hz: float) -> tuple[list[T], list[float], list[float]]:
+    """What a device measures at a rate, when, and how long each reading took, seconds."""
+    values, starts, seconds = [], [], []
+    with real_time(CONTROL):  # as the control loop has
+        for _ in range(READINGS):
+            starts.append(time.monotonic())
+            values.append(read())
+            seconds.append(time.monotonic() - starts[-1])
+            time.sleep(max(0.0, 1 / rate_hz - seconds[-1]))
+    return values, starts, seconds
+
+
+def _timing(what: str, seconds: Sequence[float], rate_hz: float) -> tuple[str, bool]:
+    slow = float(np.percentile(seconds, 95))
+    in_time = slow + JITTER_S < 1 / rate_hz
+    advice = "" if in_time else "; set the adapter's latency timer to 1 ms, close other programs, or lower rate_hz"
+    return f"{what} within {1e3 * slow:.1f} ms, a control step has {1e3 / rate_hz:.0f} ms{advice}", in_time
 
 
 def _at_park(name: str, joints: FloatArray, home: FloatArray) -> tuple[str, bool]:

@@ -13,7 +13,7 @@ from robust_instant_policy.errors import CellError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pose
 from robust_instant_policy.motion.arm import Arm
 from robust_instant_policy.motion.kinematics import ORIENTATION_COST, Kinematics
-from robust_instant_policy.robots.cell import ArmConfig
+from robust_instant_policy.robots.cell import SPEEDS, ArmConfig
 
 URDF_FOLDER = Path(motion.__file__).with_name("urdf")
 TOOL = "tool"  # the frame between the fingertips, z along the approach, y along the opening
@@ -23,11 +23,12 @@ TOOL = "tool"  # the frame between the fingertips, z along the approach, y along
 class ArmModel:
     """An arm with its gripper; see `Arm` for the units.
 
-    A user's own URDF must hold a link called `TOOL`; as many of its first joints as ``park`` has angles are the arm's,
-    a jaw after them is not.
+    ``driver`` is the kind of its own driver. A user's own URDF must hold a link called `TOOL`; as many of its first
+    joints as ``park`` has angles are the arm's, a jaw after them is not.
     """
 
     urdf: Path
+    driver: str
     triangle: GripperTriangle
     finger_speed: float
     joint_speed: float
@@ -43,6 +44,7 @@ KNOWN = {
     # the range, hence the posture cost and the tolerance (see `tasks.aloha.robot`).
     "viperx-300": ArmModel(
         URDF_FOLDER / "viperx_300.urdf",
+        "viperx",
         GripperTriangle(length=0.1537, opening=0.0692),
         finger_speed=0.10,
         joint_speed=0.8 * np.pi,
@@ -55,6 +57,7 @@ KNOWN = {
     # 180 degrees/s and a typical tool speed of 1 m/s from the UR5e data sheet; stroke of the Hand-E from its manual.
     "ur5e-hand-e": ArmModel(
         URDF_FOLDER / "ur5e_hande.urdf",
+        "ur5e",
         GripperTriangle(length=0.157, opening=0.050),
         finger_speed=0.075,
         joint_speed=0.8 * np.pi,
@@ -76,7 +79,9 @@ def arm_of(config: ArmConfig, folder: Path = Path()) -> Arm:
             raise CellError(f"{config.name}: no model {config.model!r}; known: {', '.join(KNOWN)}, or a .urdf file")
         if config.gripper is None:
             raise CellError(f"{config.name}: gripper is missing; an arm of your own needs its length and opening")
-        model = ArmModel(path, config.gripper, **OTHER)
+        model = ArmModel(path, config.driver.kind, config.gripper, **OTHER)
+    else:
+        _check_known(config, model)
     try:
         spec = mujoco.MjSpec.from_file(str(model.urdf))
         spec.compiler.fusestatic = False  # the tool frame is a separate link
@@ -95,6 +100,11 @@ def arm_of(config: ArmConfig, folder: Path = Path()) -> Arm:
         raise CellError(f"{config.name}: park must hold {revolute} angles, one for each joint, not {count}")
     triangle = config.gripper or model.triangle
     kinematics = Kinematics(compiled, TOOL, "body", count, config.base, model.posture_cost, model.orientation_cost)
+    for joint, (angle, (low, high)) in enumerate(zip(config.park, kinematics.joint_range, strict=True)):
+        if not low <= angle <= high:
+            raise CellError(
+                f"{config.name}: park turns joint {joint + 1} to {angle:g} rad, its range is {low:.2f} to {high:.2f}"
+            )
     return Arm(
         name=config.name,
         kinematics=kinematics,
@@ -107,6 +117,19 @@ def arm_of(config: ArmConfig, folder: Path = Path()) -> Arm:
         turn_tolerance=model.turn_tolerance,
         joint_acceleration=config.joint_acceleration or model.joint_acceleration,
     )
+
+
+def _check_known(config: ArmConfig, model: ArmModel) -> None:
+    """Raises `CellError` for another arm's driver, and for speeds above those that the model is known to keep."""
+    if config.driver.kind not in (model.driver, "lerobot"):
+        raise CellError(
+            f"{config.driver.where}: kind must be {model.driver} or lerobot for a {config.model}, not "
+            f"{config.driver.kind!r}"
+        )
+    for key in SPEEDS:
+        wanted, most = getattr(config, key), getattr(model, key)
+        if wanted is not None and wanted > most:
+            raise CellError(f"{config.name}: {key} is {wanted:g}, a {config.model} has at most {most:.3g}; lower it")
 
 
 def _move_tool(link: mujoco.MjsBody, tool: FloatArray) -> None:

@@ -22,9 +22,10 @@ from robust_instant_policy.robots.journal import Episode, Journal
 from robust_instant_policy.robots.leader import Leader
 from robust_instant_policy.robots.operator import ENTER, Operator
 from robust_instant_policy.robots.recording import DISCARD, QUIT, demonstration_of, guide, teach
-from robust_instant_policy.robots.station import HOLDING, Station
+from robust_instant_policy.robots.station import Station
 from robust_instant_policy.sanity import check_demonstrations
 
+COUPLES = "hold the leader near its follower's pose; Enter couples both, q ends"
 LATE_S = 5e-3  # deviation of a step that 95% of the steps must keep within
 
 
@@ -55,7 +56,8 @@ class Session:
         while self.writer.num_episodes < count:
             self._park()
             self._open_grippers()
-            seed = None if self.next_scene is None else self.next_scene()
+            with self.operator.stop.ends_waiting():
+                seed = None if self.next_scene is None else self.next_scene()
             start = self._start(f"demonstration {self.writer.num_episodes + 1} of {count}")
             if start is None:
                 return
@@ -73,14 +75,20 @@ class Session:
 
     def _start(self, words: str) -> Observation | None:
         """The start image, once the person is ready to lead; None to end."""
-        operator = self.operator
         arrange = f"{words}: arrange the scene, hands out of the image; Enter photographs it, q ends"
-        if operator.ask(arrange, ENTER + QUIT) != ENTER:
+        if self._ask(arrange, ENTER + QUIT) == QUIT:
             return None
-        start = observe(self.station.config, self.camera)
+        with self.operator.stop.ends_waiting():
+            start = observe(self.station.config, self.camera)
         self.show(start)
-        hold = "hold the leader near its follower's pose; Enter couples both, q ends"
-        return start if operator.ask(hold, ENTER + QUIT) == ENTER else None
+        return start if self._ask(COUPLES, ENTER + QUIT) == ENTER else None
+
+    def _ask(self, line: str, keys: str) -> str:
+        """The key that the person pressed; raises `StoppedError` once a stop was requested."""
+        key = self.operator.ask(line, keys)
+        if not key:
+            raise self.operator.stop.error()
+        return key
 
     def _store(self, episode: Episode, journal: Journal, seed: int | None) -> None:
         """Add the episode if the person wants it, and say at once what `rip check` finds."""
@@ -140,12 +148,10 @@ class Session:
 
     def _open_grippers(self) -> None:
         """A demonstration begins with open grippers; the person takes what is still held."""
-        operator = self.operator
         if has_open_grippers(self.station):
             return
-        if operator.ask("a gripper is closed: hold what it has; Enter opens it", ENTER) != ENTER:
-            raise StoppedError(f"{operator.stop.reason}; {HOLDING}")
-        open_grippers(self.station, operator.stop)
+        self._ask("a gripper is closed: hold what it has; Enter opens it", ENTER)
+        open_grippers(self.station, self.operator.stop)
 
     def _park(self) -> None:
         """Move the arms to their park poses; where the way is refused, the person leads them nearer."""
@@ -155,8 +161,7 @@ class Session:
                 played = park(station, operator.stop, station.config.first_run_speed)
             except UnreachableError as refused:
                 operator.say(f"  {refused}")
-                words = "hold the leader near its follower's pose; Enter couples both, q ends"
-                if operator.ask(words, ENTER + QUIT) != ENTER:
+                if self._ask(COUPLES, ENTER + QUIT) == QUIT:
                     raise StoppedError("the arms are not parked; they hold their position") from None
                 guide(station, self.leaders, operator, "coupled: lead the arm towards its park pose; Enter lets go")
                 continue

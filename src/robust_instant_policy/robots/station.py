@@ -130,7 +130,7 @@ class Station:
             if step == 0:
                 offset = self._start_offset(motion, states)
             if stop.reason:
-                stride -= 1 / braking
+                stride = stride - 1 / braking if step else 0.0
             if position >= last or stride <= 0:
                 return None
             position, step = min(position + stride, float(last)), step + 1

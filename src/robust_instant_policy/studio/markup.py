@@ -62,20 +62,26 @@ def comparison(rows: Sequence[tuple[str, Colour, str]]) -> str:
     return f'<table style="margin:0.5em 0.8em">{"".join(cells)}</table>'
 
 
-def trust(plan: Plan, available: int) -> str:
-    """HTML of the confidence of a plan and its reasons; ``available`` candidates are there."""
+def trust(plan: Plan, available: int, complete: bool) -> str:
+    """HTML of the confidence of a plan and its reasons; ``available`` candidates are there.
+
+    The confidence is told where they are ``complete``: that of some of them says little.
+    """
     ignored = [f"{index + 1} from step {plan.onset[index]}" for index in np.flatnonzero(plan.hallucinated)]
+    words = f"{len(plan.candidates)} of {available} candidates"
+    words += f", hallucinated: {', '.join(ignored)}" if ignored else ", none hallucinated"
+    if not complete:
+        return box(GREY, f"{words}; more follow, then the confidence")
     confidence = plan.confidence or 0.0
     colour = GREEN if confidence >= GOOD else ORANGE if confidence >= FAIR else RED
-    words = f"Confidence {confidence:.2f}: {len(plan.candidates)} of {available} candidates"
-    words += f", hallucinated: {', '.join(ignored)}" if ignored else ", none hallucinated"
     evidence = "".join(
         f"<tr><td style='padding-right:1em'>{html.escape(name)}</td><td>{round(value, 3):g}</td></tr>"
         for name, value in plan.evidence.items()
     )
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in plan.notes)
+    told = box(colour, f"Confidence {confidence:.2f}: {words}")
     return (
-        f"{box(colour, words)}<details style='padding:0 0.8em;{SMALL}'><summary>Reasons</summary>"
+        f"{told}<details style='padding:0 0.8em;{SMALL}'><summary>Reasons</summary>"
         f"<table>{evidence}</table><ul style='padding-left:1.2em'>{notes}</ul></details>"
     )
 

@@ -91,7 +91,7 @@ class PlanPanel:
         return self._plan.trajectory
 
     def compared(self) -> dict[str, Trajectory]:
-        """The trajectory of each method of `planner.COMPARED` from the present candidates."""
+        """The trajectory of each method of `Draft.compared` from the present candidates."""
         if self._draft is None:
             raise UsageError("there is no plan; press Plan first")
         return {method: plan.trajectory for method, plan in self._draft.compared(self._choices()).items()}
@@ -163,6 +163,7 @@ class PlanPanel:
     def _end(self, reason: str) -> None:
         self._cancel.visible = self._bar.visible = False
         self._doing.content = ""
+        self._draw()
         if reason:
             self._session.watcher.on_message(f"no plan: {reason}")
 
@@ -187,7 +188,8 @@ class PlanPanel:
             self._plan = plan
             layers = [name for name, box in self._layers.items() if box.value]
             self._view.show(plan, gaussian, self._demonstrations(), layers, self._draggable.value)
-            self._trust.content = markup.trust(plan, len(self._draft.proposal.candidates)) + LEGEND
+            complete = not self._cancel.visible
+            self._trust.content = markup.trust(plan, len(self._draft.proposal.candidates), complete) + LEGEND
 
     def _drag(self, index: int, at: float, way: FloatArray) -> None:
         with self._lock:

@@ -32,7 +32,6 @@ from robust_instant_policy.policies.aggregation import agree, take_first
 from robust_instant_policy.policies.sampling import MIN_CANDIDATES, NO_SAMPLES
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
-COMPARED = ("rip", "rip-gauss", "mean", "kat", "neighbours")
 DRAG_REACH = 0.12  # share of the trajectory's time over which a candidate that is dragged away gives way
 CLOSE_TIMEOUT_S = 5.0  # for the stage of a cancelled plan to end; a model that is busy longer is left to the system
 PAPER_ESTIMATOR = "em-number"  # the model of the paper's networks, fitted exactly in milliseconds
@@ -85,7 +84,7 @@ class Draft:
         return replace(self.proposal, candidates=tuple(candidates))
 
     def compared(self, choices: Choices) -> dict[str, Plan]:
-        """The plans of the methods `COMPARED`, from the same candidates."""
+        """The plan of each method that plans from the same candidates, and of neighbours."""
         proposal = self.changed(choices)
         settings = self.settings.changed(dof=choices.dof)
         plans = {

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import RipError, UsageError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.interrupts import raise_pending
 from robust_instant_policy.tasks.task import Image, Task, require
 
 MAX_FAILURES_IN_A_ROW = 50  # after as many failures in a row, recording stops
@@ -67,6 +68,7 @@ def record(
         seed = max(seed, writer.last_seed + 1)
     in_a_row = 0
     while writer.num_episodes < num_episodes:
+        raise_pending()
         attempt = task.demonstrate(seed, **asked)
         if attempt.success:
             writer.add(replace(attempt.demonstration, task=task.name, seed=seed), attempt.images, attempt.grippers)

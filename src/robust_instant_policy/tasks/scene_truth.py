@@ -21,7 +21,3 @@ class SceneTruth:
     def material_point(self, point: ArrayLike, part: str) -> FloatArray:
         """World ``point (3,)`` in the frame of ``part``: constant over scenes for a material point."""
         return transform_points(invert_pose(self.poses[self.names.index(part)]), point)
-
-    def world_point(self, material_point: ArrayLike, part: str) -> FloatArray:
-        """World position of ``material_point (3,)`` of ``part`` in this scene."""
-        return transform_points(self.poses[self.names.index(part)], material_point)

@@ -9,7 +9,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from robust_instant_policy.datasets.images import encode_depth
 from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.geometry import FloatArray, invert_pose, lift, transform_points
 from robust_instant_policy.sanity import Finding, check_demonstrations
 from robust_instant_policy.sanity.finding import Severity
@@ -96,6 +98,11 @@ class _Checks:
                 "depth", f"only {read.mean():.0%} of the pixels have a depth; is it in metres along the optical axis?"
             )
             raise _Broken
+        try:
+            for scene in self.observations:
+                encode_depth(scene.depth)
+        except DatasetError as error:
+            self.wrong("depth", f"it cannot be recorded: {error}")
         if self.task.workspace is not None:
             low, high = np.asarray(self.task.workspace)
             inside = ((points := _points(first, read)) >= low) & (points <= high)

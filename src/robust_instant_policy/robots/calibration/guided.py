@@ -42,7 +42,8 @@ class Guide:
         hands = []
         while len(frames) < count:
             pose = self._pose(f"pose {len(frames) + 1} of {count}: turn the board to another side, in full view")
-            frame = camera.read()
+            with self._operator.stop.ends_waiting():
+                frame = camera.read()
             try:
                 board.find(frame.rgb)
             except CalibrationError as error:
@@ -67,7 +68,8 @@ def photograph_places(camera: Camera, board: Board, count: int, operator: Operat
         where = "where it lies" if not frames else "at another place on the table, near another corner of the image"
         words = f"place {len(frames) + 1} of {count}: the board {where}, in full view; Enter photographs"
         require(operator, operator.ask(words, ENTER))
-        frame = camera.read()
+        with operator.stop.ends_waiting():
+            frame = camera.read()
         try:
             board.find(frame.rgb)
             frames.append(frame)

@@ -30,6 +30,8 @@ REVERSED = 0x01  # bit of the drive mode
 # Angles of the gripper's servo (ALOHA's constants of its follower arms).
 GRIPPER_OPEN_RAD, GRIPPER_CLOSED_RAD = 1.4910, -0.6213
 GRIPPER_CURRENT = 200  # of the goal current, units of 2.69 mA: about the 25 N with which the simulated gripper holds
+MOST_CURRENT = 1193  # the XM430's own limit
+MIN_GRIP_RAD = 0.1  # between the angles of the open and the closed gripper
 WATCHDOG = 5  # units of 20 ms: servos that hear nothing for 100 ms stop where they are
 ERROR_EVERY = 5  # states between two readings of the hardware error registers
 BAUD = 1_000_000
@@ -42,16 +44,14 @@ def make(arm: Arm, section: Section, rate_hz: float) -> ViperX:
         section.text("port"),
         section.whole("baud", BAUD, least=1),
         SERVOS,
-        section.number("timeout_ms", dxl.TIMEOUT_MS, 1.0, 1e4),
+        section.number("timeout_ms", dxl.TIMEOUT_MS, 1.0, 1e3),
     )
-    return ViperX(
-        arm.name,
-        bus,
-        arm.finger_travel,
-        section.whole("gripper_current", GRIPPER_CURRENT, least=1),
-        section.number("gripper_closed", GRIPPER_CLOSED_RAD, -np.pi, np.pi),
-        section.number("gripper_open", GRIPPER_OPEN_RAD, -np.pi, np.pi),
-    )
+    current = section.whole("gripper_current", GRIPPER_CURRENT, least=1, most=MOST_CURRENT)
+    closed = section.number("gripper_closed", GRIPPER_CLOSED_RAD, -np.pi, np.pi)
+    opened = section.number("gripper_open", GRIPPER_OPEN_RAD, -np.pi, np.pi)
+    if abs(opened - closed) < MIN_GRIP_RAD:
+        raise section.error("gripper_open", f"must be another angle than gripper_closed, {closed:g}")
+    return ViperX(arm.name, bus, arm.finger_travel, current, closed, opened)
 
 
 class ViperX:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from robust_instant_policy.errors import CellError
 from robust_instant_policy.motion.arm import Arm
-from robust_instant_policy.robots.cameras import load_factory
+from robust_instant_policy.robots.cameras import made_by
 from robust_instant_policy.robots.cell import ArmConfig
 from robust_instant_policy.robots.leader import Leader
 from robust_instant_policy.robots.leaders.arm_leader import ArmLeader, JointSource
@@ -58,16 +58,19 @@ def joint_source(config: ArmConfig) -> JointSource:
     section.text("calibration", "")
     source: JointSource
     if kind == "lerobot":
-        device = load_factory(section.text("factory"), config.leader.where)
+        device = made_by(section.text("factory"), config.leader.where)
         unit = section.text("unit", "degrees", ("degrees", "radians"))
-        source = LeRobotSource(name, device(), section.text("keys").split(), unit == "degrees")
+        source = LeRobotSource(name, device, section.text("keys").split(), unit == "degrees")
     else:
         from robust_instant_policy.robots.leaders import dynamixel_source as servos
 
         usual = servos.ALOHA_SERVOS if kind == "aloha" else servos.GELLO_SERVOS
         baud = section.whole("baud", 1_000_000 if kind == "aloha" else 57_600, least=1)
-        numbers = section.array("servos", (None,), usual).astype(int).tolist()
-        timeout_ms = section.number("timeout_ms", servos.TIMEOUT_MS, 1.0, 1e4)
+        wanted = section.array("servos", (None,), usual)
+        numbers = wanted.astype(int).tolist()
+        if (wanted != numbers).any() or len(set(numbers)) < len(numbers) or not 0 <= min(numbers) <= max(numbers) < 253:
+            raise section.error("servos", "must be different whole numbers from 0 to 252, the IDs of the servos")
+        timeout_ms = section.number("timeout_ms", servos.TIMEOUT_MS, 1.0, 1e3)
         source = servos.DynamixelSource(name, section.text("port"), baud, numbers, timeout_ms)
     section.finish()
     return source

@@ -41,7 +41,7 @@ TILT_RAD = np.deg2rad(40)  # of the gripper at the pan, away from the other one
 BEYOND_M = 0.012  # of its fingertips past the handle's middle
 LIP_DOWN_RAD = np.deg2rad(2.5)  # tilt of the pan, so that its lip lies on the table
 CARRY_M = 0.03  # lift of the pan
-LEFT, RIGHT = 0, 1
+RIGHT = 1  # number of the arm
 
 
 class SweepEnv(AlohaEnv):

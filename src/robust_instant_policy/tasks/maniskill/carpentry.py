@@ -15,12 +15,10 @@ AXES = {"x": (1.0, 0.0, 0.0, 0.0), "y": (0.70710678, 0.0, 0.0, 0.70710678), "z":
 WOOD_DENSITY = 600.0  # kg/m³
 
 
-def add_box(
-    builder: Any, size: ArrayLike, centre: ArrayLike, paint: Paint, *, collide: bool = True, yaw: float = 0.0
-) -> None:
-    """A box of ``size (3,)`` m around ``centre (3,)`` m in the link's frame, rotated by ``yaw`` rad about z."""
+def add_box(builder: Any, size: ArrayLike, centre: ArrayLike, paint: Paint, *, collide: bool = True) -> None:
+    """A box of ``size (3,)`` m around ``centre (3,)`` m in the link's frame."""
     half = np.asarray(size, dtype=np.float64) / 2
-    pose = sapien.Pose(centre, [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+    pose = sapien.Pose(centre)
     seed = int(1e4 * abs(half.sum() + np.abs(centre).sum()))
     builder.add_box_visual(pose, half, paint.material(seed))
     if collide:
@@ -44,11 +42,10 @@ def add_cylinder(
         builder.add_cylinder_collision(pose, radius, length / 2, density=WOOD_DENSITY)
 
 
-def add_ball(builder: Any, radius: float, centre: ArrayLike, paint: Paint, *, collide: bool = True) -> None:
+def add_ball(builder: Any, radius: float, centre: ArrayLike, paint: Paint) -> None:
     """A sphere around ``centre (3,)``."""
     builder.add_sphere_visual(sapien.Pose(centre), radius, paint.material())
-    if collide:
-        builder.add_sphere_collision(sapien.Pose(centre), radius, density=WOOD_DENSITY)
+    builder.add_sphere_collision(sapien.Pose(centre), radius, density=WOOD_DENSITY)
 
 
 def hinge(builder: Any, kind: str, at: ArrayLike, axis: ArrayLike, limits: tuple[float, float]) -> None:
