@@ -4,6 +4,7 @@ import shutil
 import signal
 import tarfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,19 @@ def reach(tmp_path_factory) -> Path:
     out = folder / "data" / "metaworld-reach"
     assert main(["record", "--task", "metaworld/reach", "--episodes", "4", "--out", str(out)]) == 0
     return folder
+
+
+@pytest.fixture
+def in_this_process(monkeypatch) -> None:
+    """``rip eval`` works here, not in a process of its own, which takes seconds to start."""
+    from robust_instant_policy.evaluation.workbench import Workbench
+
+    def work_here(setup, works):
+        with closing(Workbench(setup)) as bench:
+            for work in works:
+                yield from bench.run(work)
+
+    monkeypatch.setattr("robust_instant_policy.commands.eval.LocalWorkers", lambda count: work_here)
 
 
 @pytest.fixture(scope="session")

@@ -54,7 +54,9 @@ def test_the_robust_gripper_is_as_rigid_as_the_one_that_was_shown(run_folder, wo
     assert openings[0] == pytest.approx(shown.opening, abs=0.003)
 
 
-def test_an_evaluation_goes_on_where_it_stopped_and_replays_without_a_model(reach, capsys, monkeypatch):
+def test_an_evaluation_goes_on_where_it_stopped_and_replays_without_a_model(
+    reach, in_this_process, capsys, monkeypatch
+):
     monkeypatch.chdir(reach)
     command = ["eval", "--tasks", "metaworld/reach", "--methods", "rip", "rip-gauss", "rip-adaptive", "kat"]
     command += ["--demos", "4"]

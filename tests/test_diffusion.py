@@ -259,7 +259,7 @@ def test_an_evaluation_trains_diffusion_policy_and_executes_it(filmed, workbench
     assert (executed.scene, executed.variant, executed.candidates) == (scene, variant, 1)
 
 
-def test_the_report_of_an_evaluation_shows_what_was_learned(reach, tmp_path, monkeypatch):
+def test_the_report_of_an_evaluation_shows_what_was_learned(reach, in_this_process, tmp_path, monkeypatch):
     monkeypatch.chdir(reach)
     command = ["eval", "--tasks", "metaworld/reach", "--methods", "kat-dp", "--episodes", "1", "--no-videos"]
     places = ["--checkpoints", str(tmp_path), "--out", str(tmp_path / "run")]

@@ -78,7 +78,7 @@ def test_both_columns_of_table_ii_can_be_had_and_others_are_refused(url):
         rip.RobustInstantPolicy.paper(llm, "virtual")
 
 
-def test_an_evaluation_in_the_papers_configuration_is_named_so(url, reach, monkeypatch):
+def test_an_evaluation_in_the_papers_configuration_is_named_so(url, reach, in_this_process, monkeypatch):
     monkeypatch.chdir(reach)
     command = ["eval", "--config", "paper", "--features", "efficientnet", "--estimator", "em-number", "--demos", "4"]
     command += [

@@ -86,6 +86,7 @@ def test_an_unplugged_or_missing_leader_is_told(cell):
     cell.leader.fault.set("silent")
     with pytest.raises(RobotError, match=r"servo 1 \(leader of left, channel 0\) does not answer"):
         leader.read(follower())
+    leader.disconnect()
     with pytest.raises(RobotError, match="no answer from servo 1, 2, 4"):
         leader_of(cell).connect()
 

@@ -240,6 +240,11 @@ def test_a_robot_that_does_not_answer_stops_the_run_and_is_named(cell):
         ("wrist_roll.pos", "", "keys must name 5 joints"),
         ("wrist_roll.pos", "gripper.pos", "keys must name each joint once, and not the gripper"),
         ("'my_robot:make'", "'my_robot:nothing'", "factory must be module:function"),
+        (
+            "'my_robot:make'",
+            "'my_robot:desk'",
+            "my_robot:desk fails: TypeError: 'Desk' object is not callable",
+        ),
         ("'desk.urdf'", "'other.urdf'", "no model 'other.urdf'; known: viperx-300"),
         ("'desk.urdf'", "'broken.urdf'", "^[^\\n]*broken.urdf cannot be used: [^\\n]*; it needs a link called tool$"),
         ("signs = [1,", "signs = [0.5,", "signs must be 1 or -1 for each joint"),

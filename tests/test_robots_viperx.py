@@ -153,10 +153,12 @@ def test_a_signal_brakes_the_arm_on_its_path_and_it_keeps_its_torque(emulated, n
     assert emulation.limp() == []
 
 
-def test_an_arm_that_stands_elsewhere_does_not_jump_to_the_plan(emulated):
+def test_an_arm_that_stands_elsewhere_does_not_jump_to_the_plan_and_obeys_one_program(emulated):
     config, _ = emulated
     with Station(config) as station:
         motion = pick(station)
+        with pytest.raises(RobotError, match="another program uses it"), Station(config):
+            pytest.fail("two programs command one arm")
         elsewhere = replace(motion, joints=motion.joints + 0.3)
         played = station.play(elsewhere, StopRequest())
         assert "rad away from where the motion begins" in played.stopped

@@ -118,7 +118,7 @@ def test_a_gripper_state_changes_where_the_hand_is_slowest_while_the_fingers_tra
     assert (state_of_opening(0.04 + 0.06 * travel, points) == ~state).mean() > 0.9  # opening
 
 
-def test_methods_are_evaluated_and_look_again(tmp_path, monkeypatch):
+def test_methods_are_evaluated_and_look_again(in_this_process, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     suite = ["eval", "--suite", "metaworld", "--tasks", "metaworld/push", "--demos", "3", "--episodes", "1"]
     suite += ["--out", "runs/mw", "--no-videos"]

@@ -21,9 +21,8 @@ from robust_instant_policy.regression.numbers import StudentTNumbers
 from robust_instant_policy.regression.student_t import StudentTRegression, checked_curvature
 from robust_instant_policy.regression.uncertainty import confidence
 from robust_instant_policy.regression.viterbi import viterbi
+from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
-ARM_DIM = 10  # gripper point xyz, two fingertips xyz, gripper state
-POINT_DIM = 9
 TRANSITION_COST = 0.55  # votes, of all at one step, that a change of state must win: a single step never does
 STATE_SCALE = 1 / 7  # scale of the gripper state: wrong for four steps it is a hallucination, for fewer a late change
 TOLERANCE_M = 0.015  # a gripper this far off still grasps
@@ -91,13 +90,13 @@ def robust_gripper_trajectory(
     if not isinstance(triangle, GripperTriangle | None):
         raise InvalidValueError(f"triangle must be a GripperTriangle, got {type(triangle).__name__}")
     data = Candidates.from_arrays(candidates, times)
-    if data.num_dimensions % ARM_DIM:
+    if data.num_dimensions % ACTION_DIM:
         raise InvalidValueError(
-            f"candidates must be (T_q, {ARM_DIM}·A), got shape {data.values[: data.starts[1]].shape} for the first"
+            f"candidates must be (T_q, {ACTION_DIM}·A), got shape {data.values[: data.starts[1]].shape} for the first"
         )
     count = int(np.median(data.lengths)) if num_steps is None else checked_whole("num_steps", num_steps, 1)
     at = np.linspace(0.0, 1.0, count)
-    is_state = np.arange(data.num_dimensions) % ARM_DIM == POINT_DIM
+    is_state = np.arange(data.num_dimensions) % ACTION_DIM == STATE_INDEX
     points = Candidates(data.values[:, ~is_state], data.times, data.starts)
     fit, residuals = _fit_points(points, dof, estimator, seed, expected, usual)
     by_number = _fit_numbers(data, dof, estimator, seed)
@@ -117,10 +116,10 @@ def robust_gripper_trajectory(
     scaled = np.zeros_like(data.values)
     scaled[:, ~is_state] = residuals
     for arm, column in enumerate(np.flatnonzero(is_state)):
-        place = slice(column - POINT_DIM, column)
-        triplets = mean[:, arm * POINT_DIM : (arm + 1) * POINT_DIM].reshape(count, 3, 3)
+        place = slice(column - STATE_INDEX, column)
+        triplets = mean[:, arm * STATE_INDEX : (arm + 1) * STATE_INDEX].reshape(count, 3, 3)
         known = triangle or GripperTriangle.from_triplets(data.values[:, place].reshape(-1, 3, 3))
-        actions[:, place] = known.triplets(known.poses(triplets)).reshape(count, POINT_DIM)
+        actions[:, place] = known.triplets(known.poses(triplets)).reshape(count, STATE_INDEX)
         closed = data.values[:, column] > 0.5
         votes = np.stack([_nearest_in_time(at, c, own) for c, own in zip(clocks, data.split(closed), strict=True)])
         if by_number is not None:

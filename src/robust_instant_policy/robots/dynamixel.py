@@ -5,6 +5,7 @@ Registers are those of the X series' control table (Robotis e-Manual, XM540-W270
 
 from __future__ import annotations
 
+import errno
 import math
 import termios
 import time
@@ -92,7 +93,9 @@ class Bus:
             if not self._port.setBaudRate(self._baud):
                 raise RobotError(f"{self.port}: {self._baud} baud is not a rate of these servos")
             self._port.ser.timeout = 0.002  # sleep while waiting for bytes
+            self._port.ser.exclusive = True  # two programs must not command one arm
         except (OSError, serial.SerialException) as error:
+            self.close()
             raise RobotError(f"cannot open {self.port}: {_hint(self.port, error)}") from None
 
     def close(self) -> None:
@@ -220,8 +223,10 @@ def to_position(angle: FloatArray) -> np.ndarray:
 
 
 def _hint(port: str, error: Exception) -> str:
-    if getattr(error, "errno", None) == 13:
+    if getattr(error, "errno", None) == errno.EACCES:
         return "no permission; add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again"
-    if getattr(error, "errno", None) == 2:
+    if getattr(error, "errno", None) == errno.EWOULDBLOCK:
+        return "another program uses it; end that one and run again"
+    if getattr(error, "errno", None) == errno.ENOENT:
         return "it is not there; plug in the USB adapter, and see which ports exist with: ls /dev/serial/by-id"
     return str(error)

@@ -6,6 +6,7 @@ import importlib
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 from robust_instant_policy.errors import CellError
 from robust_instant_policy.robots.camera import VideoCamera
@@ -39,10 +40,10 @@ def make_camera(config: DeviceConfig, relative_to: Path) -> VideoCamera:
     elif config.kind == "folder":
         camera = RecordedCamera(relative_to / section.text("path"))
     elif config.kind == "lerobot":
-        device = load_factory(section.text("factory"), config.where)
+        device = made_by(section.text("factory"), config.where)
         camera = LeRobotCamera(
             section.text("name", "lerobot"),
-            device(),
+            device,
             section.array("intrinsics", (3, 3)),
             section.flag("aligned", False),
         )
@@ -52,15 +53,22 @@ def make_camera(config: DeviceConfig, relative_to: Path) -> VideoCamera:
     return camera
 
 
-def load_factory(name: str, where: str):
-    """The callable ``module:name`` that makes a device of one's own; the module is installed or lies in the working
-    directory."""
-    module, _, attribute = name.partition(":")
+def made_by(factory: str, where: str) -> Any:
+    """What the callable ``module:name`` of one's own makes; the module is installed or lies in the working directory.
+
+    Raises `CellError` where it is not there, and for whatever it raises.
+    """
+    module, _, attribute = factory.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
+        make = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         raise CellError(
             f"{where}: factory must be module:function of a module that is installed or lies in {os.getcwd()}: {error}"
         ) from None
+    try:
+        return make()
+    except Exception as error:
+        words = " ".join(str(error).split())
+        raise CellError(f"{where}: the factory {factory} fails: {type(error).__name__}: {words}") from error

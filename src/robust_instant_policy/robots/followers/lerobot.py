@@ -13,7 +13,7 @@ from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm
 from robust_instant_policy.motion.state import ArmState, Command
-from robust_instant_policy.robots.cameras import load_factory
+from robust_instant_policy.robots.cameras import made_by
 from robust_instant_policy.robots.cell import Section
 
 GRIPPER_OPEN = 100.0  # of LeRobot's grippers, in percent
@@ -40,7 +40,7 @@ def make(arm: Arm, section: Section, rate_hz: float) -> LeRobotFollower:
     gripper = section.text("gripper", "gripper.pos")
     if len({*keys, gripper}) <= count:
         raise section.error("keys", "must name each joint once, and not the gripper")
-    device = load_factory(section.text("factory"), f"driver of {arm.name}")()
+    device = made_by(section.text("factory"), f"driver of {arm.name}")
     signs, offsets = (
         section.array(key, (count,), [value] * count) for key, value in (("signs", 1.0), ("offsets", 0.0))
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from robust_instant_policy.errors import CellError
 from robust_instant_policy.motion.arm import Arm
-from robust_instant_policy.robots.cameras import load_factory
+from robust_instant_policy.robots.cameras import made_by
 from robust_instant_policy.robots.cell import ArmConfig
 from robust_instant_policy.robots.leader import Leader
 from robust_instant_policy.robots.leaders.arm_leader import ArmLeader, JointSource
@@ -58,9 +58,9 @@ def joint_source(config: ArmConfig) -> JointSource:
     section.text("calibration", "")
     source: JointSource
     if kind == "lerobot":
-        device = load_factory(section.text("factory"), config.leader.where)
+        device = made_by(section.text("factory"), config.leader.where)
         unit = section.text("unit", "degrees", ("degrees", "radians"))
-        source = LeRobotSource(name, device(), section.text("keys").split(), unit == "degrees")
+        source = LeRobotSource(name, device, section.text("keys").split(), unit == "degrees")
     else:
         from robust_instant_policy.robots.leaders import dynamixel_source as servos
 
