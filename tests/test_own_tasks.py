@@ -82,7 +82,7 @@ def test_a_task_and_keypoints_of_ones_own_are_evaluated(folder, capsys):
     assert "placing:PlaceBlock" in Path("runs/own/index.html").read_text()
 
 
-def test_a_defect_in_keypoints_of_ones_own_is_a_failed_plan_and_not_the_end_of_the_run(folder, capsys):
+def test_a_defect_in_keypoints_of_ones_own_is_a_failed_plan_and_not_the_end_of_the_run(folder, in_this_process, capsys):
     (folder / "broken.py").write_text("class Broken:\n    def locate(self, observation):\n        return 1 / 0\n")
     command = "eval --tasks robust_instant_policy.tasks.template:PlaceBlock --methods neighbours --demos 3 --episodes 2"
     assert main([*command.split(), "--keypoints", "broken:Broken", "--out", "run"]) == 0
@@ -91,7 +91,7 @@ def test_a_defect_in_keypoints_of_ones_own_is_a_failed_plan_and_not_the_end_of_t
     assert [failure.stage for failure in results.failures] == ["keypoints"] * 2
 
 
-def test_what_a_bare_task_lacks_is_left_out_or_told(folder, capsys):
+def test_what_a_bare_task_lacks_is_left_out_or_told(folder, in_this_process, capsys):
     (folder / "bare.py").write_text(BARE)
     (folder / "keys.py").write_text(KEYPOINTS)
     command = [

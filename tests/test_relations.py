@@ -1,6 +1,5 @@
 """The benchmark of relations, and planning from given keypoints."""
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
+import relations
 from relation_families import FAMILIES, UNCOVERED
 from relations import WITHIN_M, key_error, read_rows, way_error
 
@@ -23,7 +23,16 @@ from robust_instant_policy.policies import (
 )
 from robust_instant_policy.sanity.envelope import step_turns
 
-ROOT = Path(__file__).parents[1]
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    """Runs the benchmark with arguments."""
+
+    def run(*arguments: object) -> None:
+        monkeypatch.setattr(sys, "argv", ["relations.py", *map(str, arguments)])
+        relations.main()
+
+    return run
 
 
 @pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
@@ -92,15 +101,13 @@ def test_a_scene_between_two_ways_to_act_has_less_confidence_and_says_so():
     assert any("do different things" in note for note in close.notes)
 
 
-def test_the_benchmark_writes_rows_once_and_a_table(tmp_path):
+def test_the_benchmark_writes_rows_once_and_a_table(benchmark, tmp_path):
     rows = tmp_path / "rows.jsonl"
-    command = [
-        sys.executable, str(ROOT / "benchmarks" / "relations.py"), "--rows", str(rows), "--out", str(tmp_path),
-        "--families", "place", "--sets", "1", "--scenes", "1", "--demos", "5",
-        "--methods", "median", "neighbours", "rip", "--llm", "stand-in",
-    ]  # fmt: skip
     for _ in range(2):
-        subprocess.run(command, capture_output=True, text=True, check=True)
+        benchmark(
+            "--rows", rows, "--out", tmp_path, "--families", "place", "--sets", 1, "--scenes", 1, "--demos", 5,
+            "--methods", "median", "neighbours", "rip", "--llm", "stand-in",
+        )  # fmt: skip
         assert sorted(row.case.method for row in read_rows(rows)) == ["kat", "median", "neighbours", "rip", "rip-gauss"]
     assert "| place | 100% of 1" in (tmp_path / "tables" / "relations.md").read_text()
 
@@ -121,21 +128,19 @@ def test_a_gaussian_process_learns_what_the_chosen_frames_leave_over():
     assert np.median(errors["adaptive"]) < 0.5 * np.median(errors["world"])
 
 
-def test_the_benchmark_says_what_the_confidence_is_worth(tmp_path):
-    command = [
-        sys.executable, str(ROOT / "benchmarks" / "relations.py"), "--rows", str(tmp_path / "rows.jsonl"),
-        "--out", str(tmp_path), "--families", "place", "--sets", "1", "--scenes", "1", "--methods", "neighbours",
-        "--confidence",
-    ]  # fmt: skip
-    subprocess.run(command, capture_output=True, text=True, check=True)
+def test_the_benchmark_says_what_the_confidence_is_worth(benchmark, tmp_path):
+    benchmark(
+        "--rows", tmp_path / "rows.jsonl", "--out", tmp_path, "--families", "place", "--sets", 1, "--scenes", 1,
+        "--methods", "neighbours", "--confidence",
+    )  # fmt: skip
     table = (tmp_path / "tables" / "relations_confidence.md").read_text()
     for kind in ("usual scenes", *UNCOVERED):
         assert f"| neighbours | {kind} | 1, " in table
     assert (tmp_path / "images" / "relations_confidence.svg").stat().st_size > 1000
 
 
-def test_the_benchmark_refuses_methods_without_a_language_model_in_one_line(tmp_path):
-    command = [sys.executable, str(ROOT / "benchmarks" / "relations.py"), "--methods", "rip", "--out", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, "--llm" in done.stderr.splitlines()[-1]) == (2, True)
+def test_the_benchmark_refuses_methods_without_a_language_model_in_one_line(benchmark, tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        benchmark("--methods", "rip", "--out", tmp_path)
+    assert "--llm" in capsys.readouterr().err.splitlines()[-1]
     assert not list(tmp_path.iterdir())
