@@ -75,8 +75,13 @@ def test_an_evaluation_goes_on_where_it_stopped_and_replays_without_a_model(
 
     for file in (*Path("runs/eval").glob("results.sqlite*"), *Path("runs/eval").glob("*.parquet")):
         file.unlink()
+    monkeypatch.setattr("robust_instant_policy.evaluation.workbench.connect", no_model)
     assert main([*command, "--episodes", "1", "--out", "runs/eval", "--replay"]) == 0
     replayed = pq.read_table("runs/eval/episodes.parquet").to_pylist()
     for row in (*rows, *replayed):
         del row["seconds"], row["physics_seconds"]
     assert replayed == rows
+
+
+def no_model(spec):
+    raise AssertionError(f"{spec} was loaded")
