@@ -19,6 +19,7 @@ from robust_instant_policy.perception.registration import (
     Similarity,
     find_rivals,
     fit_shape,
+    horizontal_axes,
     polish,
     refine,
     rotated,
@@ -316,7 +317,8 @@ def _shapes(models: Sequence[Model], found: Sequence[Registration], view: View) 
     for i, (model, one) in enumerate(zip(models, found, strict=True)):
         moved = transform_points(one.pose, model.points)
         # What something hides has not changed.
-        shapes.append(fit_shape(one.pose, model.points, np.concatenate([points[owner == i], moved[view.hides(moved)]])))
+        goals = np.concatenate([points[owner == i], moved[view.hides(moved)]])
+        shapes.append(fit_shape(one.pose, model.points, horizontal_axes(model.points), goals))
     return shapes
 
 
@@ -592,11 +594,12 @@ def _alternatives(model: Model, found: Registration, view: View, others: FloatAr
 def _stretched(model: Model, poses: FloatArray, view: View) -> FloatArray:
     """``poses (C, 4, 4)`` of an object after the change of size for which each fits ``view`` best."""
     target = view.target[:, :3].astype(np.float64)
+    axes = horizontal_axes(model.points)
     motions = []
     for pose in poses:
         moved = transform_points(pose, model.points)
         goals = np.concatenate([target[within(target, moved, SHAPE_REACH_M)], moved[view.hides(moved)]])
-        motions.append(pose @ fit_shape(pose, model.points, goals))
+        motions.append(pose @ fit_shape(pose, model.points, axes, goals))
     return np.array(motions)
 
 

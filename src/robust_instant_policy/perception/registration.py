@@ -181,17 +181,16 @@ def polish(
     return refined[0], float(fitness[0]), float(similarity(refined)[0])
 
 
-def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
+def fit_shape(motion: FloatArray, source: FloatArray, axes: FloatArray, goals: FloatArray) -> FloatArray:
     """How an object of the same kind differs in size: an affine map ``(4, 4)`` of its own frame, before ``motion``.
 
-    It stretches ``source (N, 3)`` along its horizontal axes, and lifts it, to the extent of the image's points of it,
-    ``goals (M, 3)``.
+    It stretches ``source (N, 3)`` along its ``axes (3, 3)`` (`horizontal_axes`), and lifts it, to the extent of the
+    image's points of it, ``goals (M, 3)``.
     """
     goals = transform_points(invert_pose(motion), goals)
     shape = np.eye(4)
     if len(goals) < MIN_SHAPE_POINTS:
         return shape
-    axes = horizontal_axes(source)
     lower, upper = np.percentile(source @ axes.T, EXTENT_PERCENTILES, axis=0)
     new_lower, new_upper = np.percentile(goals @ axes.T, EXTENT_PERCENTILES, axis=0)
     scale = (new_upper - new_lower) / np.maximum(upper - lower, MIN_EXTENT_M)
