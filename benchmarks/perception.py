@@ -285,6 +285,7 @@ def main() -> None:
     harder = commands.add_parser("hard")
     harder.add_argument("--tasks", nargs="*", default=list(TABLE1_TASKS))
     harder.add_argument("--split", choices=list(SPLITS), default="test", help="tune thresholds on the other one")
+    harder.add_argument("--correspondence", choices=CORRESPONDENCES, default=CORRESPONDENCES[0])
     harder.add_argument("--scenes", type=int, default=NEW_SCENES)
     harder.add_argument("--data", type=Path, default=ROOT / "data" / "hard", help="folder of the demonstrations")
     harder.add_argument("--rows", type=Path, default=ROOT / "results" / "perception_hard.jsonl")
@@ -295,6 +296,7 @@ def main() -> None:
     photographs.add_argument("--out", type=Path, help="folder of the pictures (default: a new temporary one)")
     photographs.add_argument("--features", default="auto")
     photographs.add_argument("--keypoints", type=int, default=10)
+    photographs.add_argument("--correspondence", choices=CORRESPONDENCES, default=CORRESPONDENCES[0])
     photographs.add_argument("--tilt", type=float, default=0.0, help="degrees by which the camera's pose is wrong")
     quick = commands.add_parser("speed")
     quick.add_argument("--reference", type=Path)
@@ -307,12 +309,13 @@ def main() -> None:
     if arguments.command == "accuracy":
         accuracy([name for name in arguments.tasks if not name.startswith("aloha")])
     elif arguments.command == "hard":
-        hard(arguments.tasks, arguments.split, arguments.scenes, arguments.data, arguments.rows, arguments.table)
+        settings = arguments.tasks, arguments.split, arguments.correspondence, arguments.scenes
+        hard(*settings, arguments.data, arguments.rows, arguments.table)
     elif arguments.command == "real":
         if not (arguments.folder / "pair.json").exists():
             parser.error(f"{arguments.folder} holds no pair.json; perception_real.py describes the folder")
         out = arguments.out or Path(tempfile.mkdtemp(prefix="keypoints-"))
-        real(arguments.folder, out, arguments.features, arguments.keypoints, arguments.tilt)
+        real(arguments.folder, out, arguments.features, arguments.keypoints, arguments.tilt, arguments.correspondence)
     elif arguments.command == "picture":
         picture(arguments.task)
     elif arguments.command == "speed":

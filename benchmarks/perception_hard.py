@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,33 +17,38 @@ from confidence import auroc
 
 from robust_instant_policy.errors import KeypointError
 from robust_instant_policy.evaluation.scenes import obtain_demonstrations, scene_seed
-from robust_instant_policy.perception import KeypointExtractor, measure
+from robust_instant_policy.perception import CORRESPONDENCES, KeypointExtractor, measure
 from robust_instant_policy.tasks import UNSEEN_TASKS, make_task
 
-SYMMETRIES = {"goal": 72, "cube": 4}  # parts of which the image does not show by which of these turns they are turned
+SYMMETRIES = {
+    "goal": 72,
+    "cube": 4,
+    "bowl": 72,
+}  # parts of which the image does not show by which of these turns they are turned
 DEMONSTRATIONS = 10
 RIGHT_M = 0.02  # greatest error of a keypoint that is right
 Row = dict[str, Any]
 
 
-def hard(tasks: list[str], split: str, scenes: int, data: Path, rows: Path, table: Path) -> None:
+def hard(tasks: list[str], split: str, correspondence: str, scenes: int, data: Path, rows: Path, table: Path) -> None:
     """Measure what ``rows`` lacks of ``tasks`` in so many ``scenes`` of a ``split``, and write the ``table`` of all its
-    rows of these.
+    rows of these, of every correspondence.
     """
     seeds = [scene_seed(0, index, split) for index in range(scenes)]
     for name in tasks:
-        known = {row["seed"] for row in _read(rows) if row["task"] == name and row["split"] == split}
-        for row in _measure(name, [seed for seed in seeds if seed not in known], data):
+        own = {"split": split, "correspondence": correspondence, "task": name}
+        known = {row["seed"] for row in _read(rows) if own.items() <= row.items()}
+        for row in _measure(name, correspondence, [seed for seed in seeds if seed not in known], data):
             rows.parent.mkdir(parents=True, exist_ok=True)
             with rows.open("a") as file:
-                file.write(json.dumps({"split": split} | row) + "\n")
+                file.write(json.dumps(own | row) + "\n")
     found = [row for row in _read(rows) if row["task"] in tasks and row["split"] == split]
     text = "\n".join(_table(found, tasks)) + "\n"
     table.write_text(text)
     print(text)
 
 
-def _measure(name: str, seeds: list[int], data: Path) -> Iterator[Row]:
+def _measure(name: str, correspondence: str, seeds: list[int], data: Path) -> Iterator[Row]:
     """A row for each of ``seeds``: names of the keypoints' moving parts, errors in metres, and confidence."""
     if not seeds:
         return
@@ -54,13 +60,14 @@ def _measure(name: str, seeds: list[int], data: Path) -> Iterator[Row]:
         task.reset(demonstration.seed)
         images.append(task.cell.photograph())
         truths.append(task.scene_truth())
-    extractor = KeypointExtractor(features="efficientnet", workspace=task.workspace)
+    options = {"workspace": task.workspace, "correspondence": correspondence}
+    extractor = KeypointExtractor(features="efficientnet", **options)
     extractor.fit([one.observation for one in demonstrations], [one.trajectory for one in demonstrations])
     task.close()
     task = make_task(name, objects="unseen" if name in UNSEEN_TASKS else "seen", level="hard")
     for seed in seeds:
         seen = task.reset(seed)
-        row: Row = {"task": name, "seed": seed, "parts": [], "errors": [], "confidence": []}
+        row: Row = {"seed": seed, "parts": [], "errors": [], "confidence": []}
         shown = [task.cell.photograph()], [task.scene_truth()]
         try:
             found = measure(extractor, images, truths, *shown, lambda _, __, seen=seen: seen, SYMMETRIES)
@@ -79,12 +86,13 @@ def _read(rows: Path) -> list[Row]:
 
 def _table(rows: list[Row], tasks: list[str]) -> list[str]:
     lines = [
-        "| task | scenes | keypoints on moving objects | within 20 mm | median error | 90th percentile | AUROC |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| task | correspondence | scenes | keypoints on moving objects | within 20 mm | median error "
+        "| 90th percentile | AUROC |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for name, which in [*((task, [task]) for task in tasks), ("all", tasks)]:
-        chosen = [row for row in rows if row["task"] in which and row["parts"]]
-        if not chosen:
+    for (name, which), way in product([*((task, [task]) for task in tasks), ("all", tasks)], CORRESPONDENCES):
+        chosen = [row for row in rows if row["task"] in which and row["correspondence"] == way and row["parts"]]
+        if not any(row["parts"] and any(row["parts"]) for row in chosen):
             continue
         on = np.concatenate([[bool(part) for part in row["parts"]] for row in chosen])
         errors = np.concatenate([row["errors"] for row in chosen])[on]
@@ -92,7 +100,7 @@ def _table(rows: list[Row], tasks: list[str]) -> list[str]:
         told = auroc(confidence, errors < RIGHT_M)
         count, right = f"{len(errors) / len(chosen):.1f} of {len(on) / len(chosen):.0f}", (errors < RIGHT_M).mean()
         lines.append(
-            f"| {name} | {len(chosen)} | {count} | {right:.0%} "
+            f"| {name} | {way} | {len(chosen)} | {count} | {right:.0%} "
             f"| {np.median(errors) * 1e3:.1f} mm | {np.percentile(errors, 90) * 1e3:.1f} mm "
             f"| {'—' if np.isnan(told) else f'{told:.2f}'} |"
         )

@@ -113,16 +113,16 @@ def score(photographs: Photographs, pixels: FloatArray) -> Score:
     return Score(objects, errors, pixels)
 
 
-def real(folder: Path, out: Path, features: str, num_keypoints: int, tilt_deg: float) -> None:
+def real(folder: Path, out: Path, features: str, num_keypoints: int, tilt_deg: float, correspondence: str) -> None:
     """Score all images as demonstrations, then the first as the only one; write pictures to ``out``."""
     photographs = Photographs.load(folder, tilt_deg)
     images = photographs.observations
     start = time.process_time()
-    extractor = KeypointExtractor(num_keypoints, features).fit(images)
+    extractor = KeypointExtractor(num_keypoints, features, correspondence=correspondence).fit(images)
     fitted = time.process_time()
     extractor.locate(images[-1])
     print(f"processor time: fit {fitted - start:.2f} s, new image {time.process_time() - fitted:.2f} s")
-    alone = KeypointExtractor(num_keypoints, features).fit(images[:1])
+    alone = KeypointExtractor(num_keypoints, features, correspondence=correspondence).fit(images[:1])
     located = [alone.locate(image) for image in images[1:]]
     runs = {
         "all-demonstrations": extractor.pixels_,

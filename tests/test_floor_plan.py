@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -22,21 +23,31 @@ FLOORS = {
 }  # fmt: skip
 
 
+MODULES = sorted(path for path in ROOT.rglob("*.py") if path.parent != ROOT or path.stem != "__init__")
+NAMES = {
+    ".".join([PACKAGE, *path.relative_to(ROOT).with_suffix("").parts]).removesuffix(".__init__"): path
+    for path in MODULES
+}
+
+
 def room(path: Path) -> str:
     return path.relative_to(ROOT).parts[0].removesuffix(".py")
 
 
-def imported_rooms(path: Path) -> set[str]:
+def imported(path: Path) -> set[str]:
+    """Modules of the package that ``path`` imports anywhere, also for type checking only."""
     names = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
-            names.append(node.module)
+            inside = [f"{node.module}.{alias.name}" for alias in node.names]
+            names += [name if name in NAMES else node.module for name in inside]
         elif isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
-    return {name.split(".")[1] for name in names if name.startswith(PACKAGE + ".")}
+    return {name for name in names if name.startswith(PACKAGE + ".")}
 
 
-MODULES = sorted(path for path in ROOT.rglob("*.py") if path.parent != ROOT or path.stem != "__init__")
+def imported_rooms(path: Path) -> set[str]:
+    return {name.split(".")[1] for name in imported(path)}
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
@@ -45,6 +56,12 @@ def test_imports_run_downward_only(path):
     for other in imported_rooms(path) - {own}:
         allowed = FLOORS[other] < FLOORS[own] or FLOORS[own] == FLOORS[other] in (1, 6)
         assert allowed, f"{own} (floor {FLOORS[own]}) imports {other} (floor {FLOORS[other]})"
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    graph = {name: (imported(path) & NAMES.keys()) - {name} for name, path in NAMES.items()}
+    order = list(TopologicalSorter(graph).static_order())  # raises CycleError, with the circle
+    assert len(order) == len(NAMES) > 300
 
 
 def test_importing_the_package_loads_no_heavy_dependency():

@@ -198,6 +198,16 @@ def test_a_thing_in_a_hole_of_the_table_has_keypoints(hole_moves):
     assert [own for own, was in zip(found, known, strict=True) if was == 0] == [0] * known.count(0)
 
 
+def pull_along(hand) -> Trajectory:
+    """The closed gripper's fingertips at ``hand (T, 2)``, metres, 5 cm above the table."""
+    actions = np.zeros((len(hand), 10))
+    for offset, height, aside in ((0, 0.2, 0.0), (3, 0.05, 0.01), (6, 0.05, -0.01)):
+        actions[:, offset : offset + 2] = hand + np.array([0, aside])
+        actions[:, offset + 2] = height
+    actions[1:, 9] = 1.0
+    return Trajectory(actions, np.linspace(0, 1, len(hand)))
+
+
 def test_a_thing_that_a_rod_hides_in_part_is_one_thing_and_found():
     """The rod crosses the whole image, high above the table, over the middle of the thing."""
 
@@ -235,3 +245,32 @@ def test_of_two_alike_things_each_is_where_both_together_explain_the_image():
     known = owners(extractor.pixels_[0], scenes[0][1], scenes[0][0])
     assert set(known) == {0, 1}
     assert owners(extractor.locate(image).pixels, image, blocks) == known
+
+
+def test_a_handle_without_depth_tells_how_a_chest_of_another_colour_is_turned():
+    """Its square top looks the same after quarter turns; in the demonstrations the hand pulls at the handle."""
+
+    def scene(seed: int, side: int):
+        x, y = places(seed, 1)[0]
+        out = np.round([np.cos(side * np.pi / 2), np.sin(side * np.pi / 2)])
+        colour = tuple(np.random.default_rng(seed).integers(30, 226, 3))
+        chest = [(x, y, 0.07, 0.08, (colour, colour))]
+        handle = [(x + r * out[0], y + r * out[1], 0.01, 0.05, ((250, 20, 250),) * 2) for r in (0.08, 0.095, 0.11)]
+        image = photograph([*chest, *handle])
+        depth = np.where((image.rgb == (250, 20, 250)).all(axis=2), 0, image.depth)
+        hand = np.array([x, y]) + np.linspace(0.11, 0.21, 10)[:, None] * out
+        return (x, y, out), replace(image, depth=depth), pull_along(hand)
+
+    demonstrations = [scene(seed, side) for seed, side in enumerate((0, 1, 2, 3))]
+    images, paths = [one[1] for one in demonstrations], [one[2] for one in demonstrations]
+    extractor = KeypointExtractor(features="efficientnet").fit(images, paths)
+
+    def in_the_chest(keypoints, place):
+        x, y, out = place
+        return (keypoints[:, :2] - (x, y)) @ np.stack([out, (-out[1], out[0])], axis=1)
+
+    known = in_the_chest(extractor.keypoints_[0], demonstrations[0][0])
+    for seed, side in ((11, 0), (12, 1), (13, 2)):
+        place, image, _ = scene(seed, side)
+        errors = np.linalg.norm(in_the_chest(extractor.locate(image).keypoints, place) - known, axis=1)
+        assert np.median(errors) < 0.02, (side, errors)

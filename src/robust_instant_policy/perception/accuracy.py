@@ -139,11 +139,16 @@ def _pose(scene: KnownScene, part: str) -> FloatArray:
 
 
 def _moving_parts(scenes: Sequence[KnownScene]) -> set[str]:
+    """Names of the parts that all ``scenes`` have and that are not at the same place in all."""
     places = defaultdict(list)
     for scene in scenes:
         for name in scene.names:
             places[name].append(_pose(scene, name)[:3, 3])
-    return {name for name, positions in places.items() if np.ptp(positions, axis=0).max() > MIN_MOTION_M}
+    return {
+        name
+        for name, positions in places.items()
+        if len(positions) == len(scenes) and np.ptp(positions, axis=0).max() > MIN_MOTION_M
+    }
 
 
 def _part_of(pixels: FloatArray, known: Sequence[KnownScene], moving: set[str]) -> str:

@@ -29,7 +29,7 @@ from robust_instant_policy.perception.objects import (
     without,
 )
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
-from robust_instant_policy.perception.relevance import relevances, shares, still
+from robust_instant_policy.perception.relevance import hand_places, relevances, shares, still
 from robust_instant_policy.perception.selection import best_buddies, select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
 from robust_instant_policy.perception.view import Hands, View, make_view
@@ -132,7 +132,7 @@ class KeypointExtractor:
             )
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
-        objects = find_objects(views, self.seed)
+        objects = find_objects(views, self.seed, hand_places(views, trajectories) if trajectories else None)
         self.objects_ = without(objects, [thing.worst_fitness < MIN_FITNESS for thing in objects])
         if not self.objects_:
             best = max((thing.worst_fitness for thing in objects), default=0.0)

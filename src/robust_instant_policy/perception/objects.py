@@ -9,19 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
+from robust_instant_policy.geometry import FloatArray, fit_upright, invert_pose, project, transform_points
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 from robust_instant_policy.perception.parts import MIN_GAIN, candidate_parts, gain
 from robust_instant_policy.perception.registration import (
+    COLOUR_CAP_M,
+    KEPT_COLOUR_CAP_M,
+    Candidates,
     Similarity,
     find_rivals,
     fit_shape,
+    horizontal_axes,
+    polish,
     refine,
     rotated,
     settle_turn,
     vote_for_motions,
     within,
 )
+from robust_instant_policy.perception.surroundings import Surroundings, grid_around, shown
 from robust_instant_policy.perception.view import MIN_OBJECT_M2, TARGET_M, UNRELATED, View, spread_out, subsample
 
 MAX_TEMPLATE_POINTS = 250
@@ -30,6 +36,15 @@ SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of
 MIN_TARGET_POINTS = round(MIN_OBJECT_M2 / TARGET_M**2)
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
+KEPT_COLOUR_M = 0.008  # median over images of the distance in colour, for an object that keeps its colours
+HAND_REACH_M = 0.05  # of an object's points, at which a place of the hand counts 1/e
+MIN_NEAR = 0.2
+HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
+MAX_HAND_LOSS = 12.0
+ALIGNMENT_ROUNDS = 3
+EVIDENCE_SCALE = 8.0  # of the surroundings' evidence: neighbouring cells of the grid are not independent
+MIN_ADVANTAGE = 1.0  # of the logarithm of the chance, for a motion that replaces the one that ICP found
+MAX_RIVAL_LOSS = 6.0  # in units of RIVAL_SCALE, for a motion that the surroundings may speak for
 RIVAL_SCALE = 0.03  # of the score by which a motion is worse, for a weight of 1/e
 SAME_PLACE_M = 0.02
 MIN_FITNESS = 0.15  # of an object's registration in every demonstration
@@ -54,7 +69,7 @@ class Registration:
     """An object in an image: ``pose (4, 4)`` from the reference image's world to the image's, after the change of size
     ``shape (4, 4)`` (`fit_shape`), together ``motion (4, 4)``; ``fitness`` of its
     points and ``similarity`` of its descriptors, in [0, 1]; ``template``: number of the one with the most similar ones;
-    ``rivals (R, 4, 4)``: other poses that ICP came to.
+    ``rivals (R, 4, 4)``: other poses, and the chances ``shares (1 + R,)`` of this one and of these.
     """
 
     pose: FloatArray
@@ -62,6 +77,7 @@ class Registration:
     similarity: float
     template: int
     rivals: FloatArray = field(default_factory=lambda: NO_MOTIONS)
+    shares: FloatArray = field(default_factory=lambda: np.ones(1))
     shape: FloatArray = field(default_factory=lambda: np.eye(4))
 
     @property
@@ -93,13 +109,16 @@ class Template:
 class Model:
     """What an object looks like: its ``templates``, the reference image's first; ``parent``: for a part that moves
     against the rest of an object, the number of that, otherwise -1; ``family``: templates of an object with all its
-    parts, which tell its turn where it alone is symmetric; whether it ``varies`` in size between images.
+    parts, which tell its turn where it alone is symmetric; whether it ``varies`` in size between images; its
+    ``surroundings``, where the hand's places are known and it is no part; ``colour_cap``, see `icp`.
     """
 
     templates: tuple[Template, ...]
     parent: int = -1
     family: tuple[Template, ...] = ()
     varies: bool = False
+    surroundings: Surroundings | None = None
+    colour_cap: float = COLOUR_CAP_M
 
     @property
     def points(self) -> FloatArray:
@@ -124,15 +143,25 @@ class RigidObject:
         return min(registration.fitness for registration in self.registrations)
 
 
-def find_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
+def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = None) -> list[RigidObject]:
     """The rigid objects of the first view, registered in all ``views``.
 
-    A piece of the first view is one object, or several if parts of it move differently in the other views.
+    A piece of the first view is one object, or several if parts of it move differently in the other views. ``hands
+    (I, E, 3)``: places of the hand at corresponding moments of the demonstrations, metres, in the views' worlds: they
+    tell how a thing is turned that is grasped or pushed at the same place in all of them.
     """
     home = views[0]
     pieces = list(home.pieces)
     models = [Model((_template_of(home, piece, seed),)) for piece in pieces]
     found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
+    handled = set()
+    if hands is not None and len(views) > 1:
+        for number, model in enumerate(models):
+            if _nearness(model, hands[0]).max() > MIN_NEAR:
+                handled.add(number)
+            aligned, models[number] = _aligned(model, views, [row[number] for row in found], hands)
+            for row, registration in zip(found, aligned, strict=True):
+                row[number] = registration
     number = 0
     while number < len(models) and len(views) > 1:
         if models[number].parent >= 0:  # parts have no parts
@@ -156,15 +185,92 @@ def find_objects(views: Sequence[View], seed: int) -> list[RigidObject]:
         members = [i for i, model in enumerate(models) if i == number or model.parent == number]
         family = (_template_of(home, np.concatenate([pieces[i] for i in members]), seed),)
         models[number] = replace(models[number], family=family)
-    things = [_complete(models, found, number, views, seed) for number in range(len(models))]
+    things = [_complete(models, found, number, views, seed, number in handled) for number in range(len(models))]
     shapes = [
         _shapes([thing.model for thing in things], [thing.registrations[i] for thing in things], view)
         for i, view in enumerate(views)
     ]
     return [
-        thing if not varies else _with_shapes(thing, [row[number] for row in shapes])
+        _with_surroundings(_with_shapes(thing, [row[number] for row in shapes]) if varies else thing, views)
         for number, (thing, varies) in enumerate(zip(things, _vary(np.array(shapes)), strict=True))
     ]
+
+
+def _with_surroundings(thing: RigidObject, views: Sequence[View]) -> RigidObject:
+    """``thing`` with what the ``views`` show around it."""
+    if thing.model.parent >= 0 or thing.model.surroundings is None:
+        return replace(thing, model=replace(thing.model, surroundings=None))
+    motions = [one.motion for one in thing.registrations]
+    seen = Surroundings.of(thing.points, views, motions, thing.model.varies)
+    return replace(thing, model=replace(thing.model, surroundings=seen))
+
+
+def _colour_difference(xyzrgb: Float32Array, view: View, pose: FloatArray) -> float:
+    """Median distance in colour, as in `View.xyzrgb`, of points ``(N, 6)`` at ``pose`` from those that they lie on."""
+    distance, nearest = cKDTree(view.target[:, :3]).query(transform_points(pose, xyzrgb[:, :3]))
+    on = distance < CLAIM_M
+    if not on.any():
+        return float("inf")
+    return float(np.median(np.linalg.norm(xyzrgb[on, 3:] - view.target[nearest[on], 3:], axis=1)))
+
+
+def _nearness(model: Model, hands: FloatArray) -> FloatArray:
+    """Of an object to the places ``hands (E, 3)`` in the reference image: ``(E,)`` in [0, 1]."""
+    return np.exp(-((cKDTree(model.points).query(hands)[0] / HAND_REACH_M) ** 2))
+
+
+def _aligned(
+    model: Model, views: Sequence[View], found: Sequence[Registration], hands: FloatArray
+) -> tuple[list[Registration], Model]:
+    """The registrations of an object in ``views``, of those ``found`` and their rivals, for which the surroundings of
+    the object and the ``hands`` (see `find_objects`) in its frame agree best; and the object with its surroundings.
+    """
+    stretch = len(views) >= MIN_IMAGES_OF_KIND
+    points = model.points
+    near = _nearness(model, hands[0])
+    options, priors = [np.eye(4)[None]], [np.zeros(1)]
+    poses = [np.eye(4)[None]]
+    for number, (view, one) in enumerate(zip(views[1:], found[1:], strict=True), 1):
+        by_hand = NO_MOTIONS
+        if near.max() > MIN_NEAR:
+            by_hand = fit_upright(hands[0], hands[number], near + 1e-9)[None]
+            similarity = _similarity(model.templates, view, _similarities(model.templates, view))
+            by_hand = refine(
+                by_hand, model.templates[0].xyzrgb, view.target, similarity, view.hides, model.colour_cap
+            ).motions
+        rivals = _alternatives(model, one, view, by_hand)
+        prior = (rivals.score - rivals.score.max()) / RIVAL_SCALE
+        back = np.linalg.inv(rivals.motions)
+        moved = hands[number] @ np.swapaxes(back[:, :3, :3], 1, 2) + back[:, None, :3, 3]
+        squares = ((moved - hands[0]) ** 2).sum(axis=2) / (2 * HAND_SPREAD_M**2)
+        prior = prior - np.minimum(squares, MAX_HAND_LOSS) @ near
+        kept = np.union1d(0, np.flatnonzero(prior > prior.max() - 2 * MAX_RIVAL_LOSS))
+        poses.append(rivals.motions[kept])
+        options.append(_stretched(model, poses[-1], view) if stretch else poses[-1])
+        priors.append(prior[kept])
+    cells, grid = grid_around(points)
+    states = [shown(cells, view, motions) for view, motions in zip(views, options, strict=True)]
+    chosen = [0] * len(views)
+    for turn in range(ALIGNMENT_ROUNDS):
+        for i in range(1, len(views)):
+            others = np.array([states[k][chosen[k]] for k in range(len(views)) if k < i or (k > i and turn)])
+            seen = Surroundings.from_states(cells, grid, others, stretch)
+            chosen[i] = int((priors[i] + seen.evidence_in(states[i]) / EVIDENCE_SCALE).argmax())
+    known = model.templates[0].xyzrgb
+    typical = np.median([_colour_difference(known, views[i], poses[i][chosen[i]]) for i in range(1, len(views))])
+    if typical < KEPT_COLOUR_M:
+        model = replace(model, colour_cap=KEPT_COLOUR_CAP_M)
+    aligned = [found[0]]
+    for i in range(1, len(views)):
+        one, pose = found[i], poses[i][chosen[i]]
+        if (pose != one.pose).any():
+            similarity = _similarity(model.templates, views[i], _similarities(model.templates, views[i]))
+            source = model.templates[one.template].xyzrgb
+            pose, fitness, similar = polish(pose, source, views[i].target, similarity, views[i].hides, model.colour_cap)
+            one = Registration(pose, fitness, similar, one.template)
+        aligned.append(one)
+    agreed = np.array([states[k][chosen[k]] for k in range(len(views))])
+    return aligned, replace(model, surroundings=Surroundings.from_states(cells, grid, agreed, stretch))
 
 
 def _attached(models: Sequence[Model], sizes: Sequence[int], found: Sequence[Sequence[Registration]]) -> list[Model]:
@@ -211,7 +317,8 @@ def _shapes(models: Sequence[Model], found: Sequence[Registration], view: View) 
     for i, (model, one) in enumerate(zip(models, found, strict=True)):
         moved = transform_points(one.pose, model.points)
         # What something hides has not changed.
-        shapes.append(fit_shape(one.pose, model.points, np.concatenate([points[owner == i], moved[view.hides(moved)]])))
+        goals = np.concatenate([points[owner == i], moved[view.hides(moved)]])
+        shapes.append(fit_shape(one.pose, model.points, horizontal_axes(model.points), goals))
     return shapes
 
 
@@ -277,16 +384,28 @@ def _split(
 
 
 def _complete(
-    models: Sequence[Model], found: Sequence[Sequence[Registration]], number: int, views: Sequence[View], seed: int
+    models: Sequence[Model],
+    found: Sequence[Sequence[Registration]],
+    number: int,
+    views: Sequence[View],
+    seed: int,
+    handled: bool,
 ) -> RigidObject:
-    """Object ``number`` with templates from all views, and registered with them; the best views come first."""
+    """Object ``number`` with templates from all views, and registered with them; the best views come first. One that is
+    ``handled`` stays where the hand tells.
+    """
     model, registrations = models[number], [row[number] for row in found]
     templates = list(model.templates)
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
         better = [k for k in range(len(models)) if found[i][k].score > found[i][number].score]
         taken = _explained(models, found[i], better)
-        grown = [*models[:number], replace(model, templates=tuple(templates)), *models[number + 1 :]]
-        registrations[i] = _register_model(grown, number, views[i], found[i], taken, registrations[i].pose[None])
+        start = registrations[i].pose[None]
+        if handled:
+            one = register(templates, views[i], taken, start, vote=False, colour_cap=model.colour_cap)
+            registrations[i] = one if one.fitness else registrations[i]
+        else:
+            grown = [*models[:number], replace(model, templates=tuple(templates)), *models[number + 1 :]]
+            registrations[i] = _register_model(grown, number, views[i], found[i], taken, start)
         others = _explained(models, found[i], [k for k in range(len(models)) if k != number])
         templates += _another_template(views[i], registrations[i], templates, others, seed)
     return RigidObject(replace(model, templates=tuple(templates)), tuple(registrations))
@@ -307,13 +426,16 @@ def _register_model(
         # In one image parts hide some of their object, in all of them nothing.
         whole = np.concatenate([template.surface for template in models[model.parent].templates])
         beside = transform_points(parent.motion, whole)
-        return register(model.templates, view, taken, starts, parent=parent.pose, beside=beside)
-    alone = register(model.templates, view, taken, starts)
-    if not model.family:
-        return alone
-    family = register(model.family, view, taken)
-    in_family = register(model.templates, view, taken, family.pose[None], vote=False)
-    return alone if alone.score > in_family.score + MUCH_BETTER else in_family
+        return register(
+            model.templates, view, taken, starts, parent=parent.pose, beside=beside, colour_cap=model.colour_cap
+        )
+    alone = register(model.templates, view, taken, starts, colour_cap=model.colour_cap)
+    if model.family:
+        family = register(model.family, view, taken, colour_cap=model.colour_cap)
+        in_family = register(model.templates, view, taken, family.pose[None], vote=False, colour_cap=model.colour_cap)
+        if alone.score <= in_family.score + MUCH_BETTER:
+            alone = in_family
+    return _decided(model, alone, view)
 
 
 def register_all(models: Sequence[Model], view: View) -> list[Registration]:
@@ -423,6 +545,7 @@ def register(
     vote: bool = True,
     parent: FloatArray | None = None,
     beside: FloatArray | None = None,
+    colour_cap: float = COLOUR_CAP_M,
 ) -> Registration:
     """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world.
 
@@ -454,20 +577,80 @@ def register(
         candidates = candidates[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
     index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
     source, similarity = templates[index].xyzrgb, _similarity(templates, view, similar)
-    refined = refine(candidates, source, target, similarity, view.hides)
-    pose = settle_turn(refined.motions[0], source, target, similarity, view.hides)
+    refined = refine(candidates, source, target, similarity, view.hides, colour_cap)
+    pose = settle_turn(refined.motions[0], source, target, similarity, view.hides, colour_cap)
     return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index, refined.motions[1:])
+
+
+def _alternatives(model: Model, found: Registration, view: View, others: FloatArray = NO_MOTIONS) -> Candidates:
+    """The pose that was ``found``, its rivals, ``others (S, 4, 4)``, and the first one turned."""
+    similarity = _similarity(model.templates, view, _similarities(model.templates, view))
+    motions = np.concatenate([found.pose[None], found.rivals, others])
+    return find_rivals(
+        motions, model.templates[found.template].xyzrgb, view.target, similarity, view.hides, model.colour_cap
+    )
+
+
+def _stretched(model: Model, poses: FloatArray, view: View) -> FloatArray:
+    """``poses (C, 4, 4)`` of an object after the change of size for which each fits ``view`` best."""
+    target = view.target[:, :3].astype(np.float64)
+    axes = horizontal_axes(model.points)
+    motions = []
+    for pose in poses:
+        moved = transform_points(pose, model.points)
+        goals = np.concatenate([target[within(target, moved, SHAPE_REACH_M)], moved[view.hides(moved)]])
+        motions.append(pose @ fit_shape(pose, model.points, axes, goals))
+    return np.array(motions)
+
+
+def _preferred(model: Model, poses: FloatArray, chance: FloatArray) -> int:
+    """Number of the one of ``poses (C, 4, 4)`` with the best ``chance (C,)``, or of the first, which ICP found, where
+    that puts the object at the same place.
+    """
+    places = model.points @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    elsewhere = np.linalg.norm(places - places[0], axis=2).mean(axis=1) > SAME_PLACE_M
+    best = int(chance.argmax())
+    return best if elsewhere[best] and chance[best] > chance[~elsewhere].max() + MIN_ADVANTAGE else 0
+
+
+def _decided(model: Model, found: Registration, view: View) -> Registration:
+    """``found`` or the rival of it that what ``view`` shows around the object speaks for, with the chances of all."""
+    if model.surroundings is None or not found.fitness:
+        return found
+    rivals = _alternatives(model, found, view)
+    chance = (rivals.score - rivals.score.max()) / RIVAL_SCALE
+    kept = np.union1d(0, np.flatnonzero(chance > -MAX_RIVAL_LOSS))
+    motions = _stretched(model, rivals.motions[kept], view) if model.surroundings.stretch else rivals.motions[kept]
+    chance = chance[kept] + model.surroundings.evidence(view, motions) / EVIDENCE_SCALE
+    best = _preferred(model, rivals.motions[kept], chance)
+    order = np.array([best, *(k for k in range(len(kept)) if k != best)])
+    shares = np.exp(np.minimum(chance[order] - chance[best], 0))
+    pose, fitness, similarity = rivals.motions[kept[best]], found.fitness, found.similarity
+    if best:
+        source = model.templates[found.template].xyzrgb
+        measured = _similarity(model.templates, view, _similarities(model.templates, view))
+        pose, fitness, similarity = polish(pose, source, view.target, measured, view.hides, model.colour_cap)
+    return replace(
+        found,
+        pose=pose,
+        fitness=fitness,
+        similarity=similarity,
+        rivals=rivals.motions[kept[order[1:]]],
+        shares=shares / shares.sum(),
+    )
 
 
 def certainty(model: Model, found: Registration, view: View, points: FloatArray) -> FloatArray:
     """Share ``(N,)``, in [0, 1], of the motions, weighted by how well they explain ``view``, that put ``points (N, 3)``
     of the reference image where ``found`` does.
     """
-    similarity = _similarity(model.templates, view, _similarities(model.templates, view))
-    motions = np.concatenate([found.pose[None], found.rivals])
-    rivals = find_rivals(motions, model.templates[found.template].xyzrgb, view.target, similarity, view.hides)
-    weights = np.exp(np.minimum(rivals.score - rivals.score[0], 0) / RIVAL_SCALE)
-    places = points @ np.swapaxes(rivals.motions[:, :3, :3], 1, 2) + rivals.motions[:, None, :3, 3]
+    if len(found.shares) > 1:
+        motions, weights = np.concatenate([found.pose[None], found.rivals]), found.shares
+    else:
+        rivals = _alternatives(model, found, view)
+        motions = rivals.motions
+        weights = np.exp(np.minimum(rivals.score - rivals.score[0], 0) / RIVAL_SCALE)
+    places = points @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
     same = np.linalg.norm(places - places[0], axis=2) < SAME_PLACE_M
     return (weights[:, None] * same).sum(axis=0) / weights.sum()
 

@@ -35,7 +35,8 @@ MATCHES_PER_POINT = 3
 MAX_MATCHES = 400  # the most similar; more do not change the peaks
 VOTE_EXPONENT = 4  # of the similarity, for a match's vote
 # ICP.
-COLOUR_CAP_M = 0.010  # greatest colour distance: objects of one kind have many colours
+COLOUR_CAP_M = 0.010  # greatest colour distance: objects of one kind have many colours,
+KEPT_COLOUR_CAP_M = 0.020  # but not an object that keeps its own
 RESIDUAL_M = 0.010  # at which a point counts 1/e in the fitness
 OWN_REACH_M = 0.04  # image points further from the object belong to others
 RESTART_ANGLES = np.deg2rad([0.0, -25.0, 25.0])
@@ -119,7 +120,7 @@ class Candidates:
 
 
 def refine(
-    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden, cap: float
 ) -> Candidates:
     """The best candidates after ICP from ``motions (P, 4, 4)``.
 
@@ -129,12 +130,12 @@ def refine(
     """
     centre = source[:, :3].mean(axis=0)
     starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
-    starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M, hidden)
+    starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M, hidden, cap)
     score = (fitness + similarity(starts)) / 2
     order = np.argsort(-score, kind="stable")
     leading = _distinct(starts, centre, order[score[order] > score.max() - MAX_BEHIND])[:FINALISTS]
     refined = [
-        icp(start[None], source, _near(start, source, target), FINE_REACH_M, hidden) for start in starts[leading]
+        icp(start[None], source, _near(start, source, target), FINE_REACH_M, hidden, cap) for start in starts[leading]
     ]
     finalists, fitness = (np.concatenate(parts) for parts in zip(*refined, strict=True))
     similarities = similarity(finalists)
@@ -143,13 +144,13 @@ def refine(
 
 
 def settle_turn(
-    motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+    motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden, cap: float
 ) -> FloatArray:
     """``motion (4, 4)``, turned to the descriptors' mean rotation if points do not determine it, as for a disc."""
     centre = source[:, :3].mean(axis=0)
     alternatives = rotated(motion, centre, SMALL_TURNS)
     target = _around(motion[None], source, target)
-    fitness = icp(alternatives, *_coarse(source, target), (), hidden)[1]
+    fitness = icp(alternatives, *_coarse(source, target), (), hidden, cap)[1]
     if fitness.min() <= fitness[len(alternatives) // 2] - MAX_SYMMETRY_LOSS:
         return motion
     likelihood = similarity(alternatives)
@@ -158,7 +159,7 @@ def settle_turn(
 
 
 def find_rivals(
-    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden
+    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden, cap: float
 ) -> Candidates:
     """``motions (C, 4, 4)``, the best first, and that one turned by `LARGE_TURNS` or slid by `SLIDES_M`, all measured
     with a subset of the points.
@@ -167,22 +168,29 @@ def find_rivals(
     slid = np.repeat(motions[:1], len(SLIDES_M), axis=0)
     slid[:, :3, 3] += SLIDES_M
     coarse = _coarse(source, _around(motions, source, target))
-    turned = icp(turned, *coarse, RIVAL_REACH_M, hidden)[0]
+    turned = icp(turned, *coarse, RIVAL_REACH_M, hidden, cap)[0]
     every = np.concatenate([motions, turned, slid])
-    return Candidates(every, icp(every, *coarse, (), hidden)[1], similarity(every))
+    return Candidates(every, icp(every, *coarse, (), hidden, cap)[1], similarity(every))
 
 
-def fit_shape(motion: FloatArray, source: FloatArray, goals: FloatArray) -> FloatArray:
+def polish(
+    motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden, cap: float
+) -> tuple[FloatArray, float, float]:
+    """``motion (4, 4)`` after ICP with all points, with its fitness and similarity."""
+    refined, fitness = icp(motion[None], source, _near(motion, source, target), FINE_REACH_M, hidden, cap)
+    return refined[0], float(fitness[0]), float(similarity(refined)[0])
+
+
+def fit_shape(motion: FloatArray, source: FloatArray, axes: FloatArray, goals: FloatArray) -> FloatArray:
     """How an object of the same kind differs in size: an affine map ``(4, 4)`` of its own frame, before ``motion``.
 
-    It stretches ``source (N, 3)`` along its horizontal axes, and lifts it, to the extent of the image's points of it,
-    ``goals (M, 3)``.
+    It stretches ``source (N, 3)`` along its ``axes (3, 3)`` (`horizontal_axes`), and lifts it, to the extent of the
+    image's points of it, ``goals (M, 3)``.
     """
     goals = transform_points(invert_pose(motion), goals)
     shape = np.eye(4)
     if len(goals) < MIN_SHAPE_POINTS:
         return shape
-    axes = horizontal_axes(source)
     lower, upper = np.percentile(source @ axes.T, EXTENT_PERCENTILES, axis=0)
     new_lower, new_upper = np.percentile(goals @ axes.T, EXTENT_PERCENTILES, axis=0)
     scale = (new_upper - new_lower) / np.maximum(upper - lower, MIN_EXTENT_M)
@@ -252,16 +260,21 @@ def rotated(motion: FloatArray, centre: FloatArray, angles: FloatArray) -> Float
 
 
 def icp(
-    motions: FloatArray, source: Float32Array, target: Float32Array, reaches: tuple[float, ...], hidden: Hidden
+    motions: FloatArray,
+    source: Float32Array,
+    target: Float32Array,
+    reaches: tuple[float, ...],
+    hidden: Hidden,
+    cap: float,
 ) -> tuple[FloatArray, FloatArray]:
     """``motions (C, 4, 4)`` after one ICP iteration for each of ``reaches`` (kernel widths, metres), and their fitness.
 
     Matches go both ways: an object shifted along itself still covers most of its image points, and only those left
     uncovered show the error. The fitness in [0, 1] is the geometric mean of both ways. Points that are ``hidden`` count
-    less.
+    less. ``cap``: greatest distance in colour, metres as in `View.xyzrgb`.
     """
     source_xyz, target_xyz = (points[:, :3].astype(np.float64) for points in (source, target))
-    colours = colour_costs(source, target)
+    colours = colour_costs(source, target, cap)
     origin = target_xyz.mean(axis=0)  # near the points, for the precision of the squares
     goals = target_xyz - origin
     quadratic = np.stack([*(-2 * goals.T), (goals**2).sum(axis=1), np.ones(len(goals))]).astype(np.float32)
@@ -307,11 +320,11 @@ def icp(
     return motions, np.sqrt(matched * covered)
 
 
-def colour_costs(source: Float32Array, target: Float32Array) -> Float32Array:
-    """Squared colour distances ``(N, M)`` of ``source (N, 6)`` and ``target (M, 6)``, capped, in square metres."""
+def colour_costs(source: Float32Array, target: Float32Array, cap: float) -> Float32Array:
+    """Squared colour distances ``(N, M)`` of ``source (N, 6)`` and ``target (M, 6)``, at most ``cap``, in metres."""
     a, b = source[:, 3:], target[:, 3:]
     squares = a @ (-2 * b.T) + (b**2).sum(axis=1) + (a**2).sum(axis=1)[:, None]
-    return np.minimum(squares, np.float32(COLOUR_CAP_M**2))
+    return np.minimum(squares, np.float32(cap**2))
 
 
 def register_translation(pose: FloatArray, source: Float32Array, target: Float32Array) -> FloatArray:
@@ -322,7 +335,7 @@ def register_translation(pose: FloatArray, source: Float32Array, target: Float32
     """
     start = transform_points(pose, source[:, :3])
     goals = target[:, :3].astype(np.float64)
-    constant = colour_costs(source, target) + (goals**2).sum(axis=1)
+    constant = colour_costs(source, target, COLOUR_CAP_M) + (goals**2).sum(axis=1)
     shift = np.zeros(3)
     for reach in LOCAL_REACH_M:
         moved = start + shift

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
+from robust_instant_policy.perception.view import View
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 CONTACT_M = 0.05  # distance of the fingertips at which an object counts 1/e
@@ -27,13 +28,26 @@ def relevances(objects: Sequence[Sequence[FloatArray]], trajectories: Sequence[T
     """
     scenes = zip(*objects, strict=True)
     events = [_events(points, path) for points, path in zip(scenes, trajectories, strict=True)]
-    # The last events of all demonstrations correspond: a repeated attempt comes before them.
-    common = min(len(one) for one in events)
-    hands = np.array([one[-common:] for one in events])
+    hands = _corresponding(events)
     of_events = np.array([_relevances(points, hands) for points in objects])
     total = of_events.sum(axis=1)
     most_at_an_event = ((of_events == of_events.max(axis=0)) & (of_events >= MIN_RELEVANCE)).any(axis=1)
     return np.where(most_at_an_event | (total >= MIN_RELEVANCE * total.max()), total, 0)
+
+
+def hand_places(views: Sequence[View], trajectories: Sequence[Trajectory]) -> FloatArray:
+    """Places ``(I, E, 3)`` of the hand at the events of each demonstration, metres, in the worlds of its ``views``."""
+    places = []
+    for view, path in zip(views, trajectories, strict=True):
+        world = transform_points(view.to_world, view.points)
+        places.append(transform_points(invert_pose(view.to_world), _events([world], path)))
+    return _corresponding(places)
+
+
+def _corresponding(events: Sequence[FloatArray]) -> FloatArray:
+    """``(I, E, 3)``: the last events of all demonstrations correspond: a repeated attempt comes before them."""
+    common = min(len(one) for one in events)
+    return np.array([one[-common:] for one in events])
 
 
 def still(points: Sequence[FloatArray]) -> bool:

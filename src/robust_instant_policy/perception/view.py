@@ -47,6 +47,10 @@ STRIP_M = 0.035  # that an arm or a rod above the table may hide between two pie
 SAME_COLOUR = 0.2  # greatest difference of the mean colours of such pieces, of a range of 1
 MIN_TOLD_SHARE = 1 / 3  # of the size of an object: smaller pieces are noise
 MAX_TOLD = 3
+SQUARE_M = 0.004  # edge of the squares of `Ground`,
+SQUARE_SPACINGS = 1.2  # or of this many distances between points, if that is more
+FILLED_PX = 8  # from things: greatest distance of pixels without a steady depth that belong to them
+FILLED_SMOOTHING_PX = 3
 TARGET_M = 0.005  # edge of the cubes with one point each in `View.target`
 COLOUR_SCALE_M = 0.06  # metres in an XYZRGB point for the difference between black and white in one channel
 MIN_TILT_RAD = np.deg2rad(1.0)  # of the table in the world; less is the noise of its plane
@@ -58,6 +62,7 @@ DEEPEST_M = 0.3  # of a hole in a table: what is lower is the floor under it
 HAND_SHARE = 0.5  # of the distance from the gripper point to the fingertips: what is nearer to it is the hand
 TOLD_BORDER_SHARE = 0.01  # of the image, that something at its border covers
 
+FREE, OCCUPIED = 1, 2
 TABLE, BELOW, BESIDE, HIGH, BORDER, SMALL, OUTSIDE, UNKNOWN, UNRELATED, HAND = range(-1, -11, -1)
 REASONS = {
     TABLE: "table",
@@ -78,6 +83,34 @@ CUT_OFF_NOTE = (
 
 
 @dataclass(frozen=True, eq=False)
+class Ground:
+    """What an image shows of the horizontal plane: ``states (X, Y)`` of squares, 0 where it shows nothing, `FREE` where
+    the table, `OCCUPIED` where something stands; ``corner (2,)`` of the first square and ``edge``, metres.
+    """
+
+    states: NDArray[np.int8]
+    corner: FloatArray
+    edge: float
+
+    @classmethod
+    def of(cls, occupied: FloatArray, free: FloatArray, edge: float) -> Ground:
+        """From places ``(N, 2)`` where something stands, and ``(M, 2)`` where the table is seen, metres."""
+        every = np.concatenate([free, occupied])
+        corner = every.min(axis=0) - edge  # the squares at the border stay empty: `at` clips to them
+        x, y = ((every - corner) / edge).astype(np.intp).T
+        states = np.zeros((x.max() + 2, y.max() + 2), dtype=np.int8)
+        states[x[: len(free)], y[: len(free)]] = FREE
+        states[x[len(free) :], y[len(free) :]] = OCCUPIED  # a thing also where the table is seen through it
+        return cls(states, corner, edge)
+
+    def at(self, places: FloatArray) -> NDArray[np.int8]:
+        """States ``(...)`` at ``places (..., 2)``, metres."""
+        number = np.floor((places - self.corner) / self.edge).astype(np.intp)
+        x, y = (number[..., axis].clip(0, size - 1) for axis, size in enumerate(self.states.shape))
+        return self.states[x, y]
+
+
+@dataclass(frozen=True, eq=False)
 class View:
     """An ``observation``, its ``descriptors``, its ``depth (H, W)`` in metres, and its foreground.
 
@@ -86,7 +119,8 @@ class View:
     units of `COLOUR_SCALE_M`; ``pieces``, the points' numbers by connected piece; ``target (M, 6)``, a sample of
     ``xyzrgb`` to which objects are registered; ``cells (C,)`` of the descriptor map: first those with foreground,
     whose mean points are ``cell_points (F, 3)``, then their neighbours. ``labels (h, w)``, subsampled by ``stride``: a
-    pixel's piece, or the key in `REASONS` of what it is instead. ``least``: points of the smallest object.
+    pixel's piece, or the key in `REASONS` of what it is instead. ``ground``: where something stands.
+    ``least``: points of the smallest object.
     ``notes`` tell what was unusual.
     """
 
@@ -101,6 +135,7 @@ class View:
     cells: IntArray
     cell_points: FloatArray
     labels: NDArray[np.int16]
+    ground: Ground
     stride: int
     least: int
     notes: tuple[str, ...]
@@ -199,9 +234,15 @@ def make_view(
     _join_hidden(label, points, usable)
     label[(label >= 0) & np.isin(label, label[of_hand])] = HAND
     cut_off = _leave_out_arms(label, heights, pixels, least)
-    _join_behind(label, points, usable, observation.rgb[pixels[:, 1], pixels[:, 0]] / 255)
+    # Above the table, be it left out for that or for being outside the workspace.
+    over = np.zeros(usable.shape, dtype=bool)
+    over[usable] = np.isin(label, (BORDER, HIGH, HAND)) | ((label == OUTSIDE) & (heights > HOVERING_M))
+    _join_behind(label, points, usable, over, observation.rgb[pixels[:, 1], pixels[:, 0]] / 255)
     small = _leave_out_small(label, heights, pixels, least)
 
+    labels = np.full(usable.shape, UNKNOWN, dtype=np.int16)
+    labels[usable] = label
+    free = points[label == TABLE, :2]
     kept = np.flatnonzero(label >= 0)
     if not len(kept):
         raise KeypointError(
@@ -209,8 +250,6 @@ def make_view(
         )
     at = pixels[kept, 1], pixels[kept, 0]
     colours = np.divide(observation.rgb[at], 255, dtype=np.float32)
-    labels = np.full(usable.shape, UNKNOWN, dtype=np.int16)
-    labels[usable] = label
     points, label = points[kept], label[kept]
     xyzrgb = np.concatenate([points, colours * COLOUR_SCALE_M], axis=1).astype(np.float32)
     pieces = tuple(np.flatnonzero(label == piece) for piece in range(label.max() + 1))
@@ -219,6 +258,7 @@ def make_view(
     cells, cell_points = _cell_points(descriptors.cells_at(pixels[kept]), label, points)
     neighbours = np.setdiff1d([descriptors.shifted(cells, row, col) for row, col in NEIGHBOURS], cells)
     cells = np.concatenate([cells, neighbours])
+    occupied = np.concatenate([points, _filled(observation, depth, labels, over, stride)])[:, :2]
     arm = ""
     if (labels == HAND).any() or (labels == BORDER).mean() > TOLD_BORDER_SHARE:
         arm = "an arm is in the image: it is left out, and what it hides is not seen; park it outside the image"
@@ -235,6 +275,7 @@ def make_view(
         cells,
         cell_points,
         labels,
+        Ground.of(occupied, free, max(SQUARE_M, SQUARE_SPACINGS * stride * pixel_m)),
         stride,
         least,
         notes,
@@ -260,6 +301,27 @@ def subsample(indices: IntArray, count: int, seed: int) -> IntArray:
 def spread_out(points: ArrayLike) -> IntArray:
     """Numbers of one of ``points (N, 3)``, metres, in each cube with edges of `TARGET_M`."""
     return np.unique(_cubes(np.asarray(points), TARGET_M), return_index=True)[1]
+
+
+def _filled(
+    observation: Observation, depth: Float32Array, labels: NDArray[np.int16], over: NDArray[np.bool_], stride: int
+) -> FloatArray:
+    """Points ``(N, 3)``, metres, world, of pixels without a steady depth that are beside a thing and have not the
+    table's colour, at the depth of the thing: stereo cameras see no depth on narrow parts.
+    """
+    things, table = labels >= 0, labels == TABLE
+    if not table.any():
+        return np.zeros((0, 3))
+    distance, nearest = distance_transform_edt(~things, return_indices=True)
+    asked = (labels == UNKNOWN) & (distance <= FILLED_PX / stride) & ~binary_dilation(over, iterations=GAP_PX)
+    colours = observation.rgb[::stride, ::stride]
+    smoothed = uniform_filter(observation.rgb, (FILLED_SMOOTHING_PX, FILLED_SMOOTHING_PX, 1))[::stride, ::stride]
+    of_table = TableColour.fit(np.divide(colours[table], 255, dtype=np.float32))
+    for seen, least in ((smoothed, MIN_DISTANCE_SMOOTHED), (colours, MIN_DISTANCE_POINT)):
+        asked[asked] = of_table.distance(np.divide(seen[asked], 255, dtype=np.float32)) > least
+    rows, cols = nearest[:, asked] * stride
+    pixels = np.argwhere(asked)[:, ::-1] * stride
+    return lift(pixels, depth[rows, cols], observation.intrinsics, observation.camera_pose)
 
 
 def _cubes(points: FloatArray, edge: float) -> IntArray:
@@ -365,9 +427,11 @@ def _leave_out_arms(label: IntArray, heights: FloatArray, pixels: IntArray, leas
     return CUT_OFF_NOTE if alone else ""
 
 
-def _join_behind(label: IntArray, points: FloatArray, usable: NDArray[np.bool_], colours: FloatArray) -> None:
+def _join_behind(
+    label: IntArray, points: FloatArray, usable: NDArray[np.bool_], over: NDArray[np.bool_], colours: FloatArray
+) -> None:
     """Join the pieces in ``label (N,)`` of one of ``colours (N, 3)`` that are apart only where something that is above
-    the table hides what is between them.
+    the table, at the pixels ``over (h, w)``, hides what is between them.
 
     ``points (N, 3)`` are those of the ``usable (h, w)`` pixels.
     """
@@ -375,7 +439,7 @@ def _join_behind(label: IntArray, points: FloatArray, usable: NDArray[np.bool_],
     grid[usable] = label
     number = np.full(usable.shape, -1)
     number[usable] = np.arange(len(points))
-    above = binary_dilation(np.isin(grid, (BORDER, HIGH, HAND)), iterations=GAP_PX) & (grid < 0)
+    above = binary_dilation(over, iterations=GAP_PX) & (grid < 0)
     if not above.any() or not (grid >= 0).any():
         return
     nearest = number[tuple(distance_transform_edt(grid < 0, return_distances=False, return_indices=True))]

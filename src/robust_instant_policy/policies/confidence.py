@@ -51,7 +51,6 @@ GOOD_PRECISION_M = 0.025
 LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one scene
 NOISE_M = 0.02  # variation of a coordinate below which it says nothing about a scene
 RIGID_M = 0.010  # variation of the distance of two keypoints below which they belong to one rigid thing
-NEAREST = 3  # keypoints with which each is compared where nothing is rigid
 DISTANCE_M = 0.003  # with which a distance between keypoints is measured
 RECORDING = {"gripper state", "grasp", "rotation"}  # kinds of findings
 MIN_SCENES = 3  # below which nothing is known of their variation
@@ -188,11 +187,10 @@ def _squared_distance(rows: FloatArray, row: FloatArray) -> float:
 def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
     """How far distances between keypoints of one thing differ from the demonstrations', of the worst thing.
 
-    A keypoint is compared with its `NEAREST` keypoints, those to which its distance varies least, and with all to which
-    it is preserved (`RIGID_M`); a thing is what the first of them and the preserved distances join. For each thing: the
-    upper quartile of the differences from the median distances, over their variation, and over the demonstrations' own
-    quartile; above 1 they differ by more than usual. ``demonstrated (I, K, 3)`` and ``keypoints (K, 3)`` in metres; NaN
-    for fewer than `MIN_SCENES`, or for a single keypoint.
+    A thing is what preserved distances join (`RIGID_M`), and for each keypoint that to which it varies least. For each
+    thing: the upper quartile of the differences from the median of these distances, over their variation, and over the
+    demonstrations' own quartile; above 1 they differ by more than usual. ``demonstrated (I, K, 3)`` and ``keypoints (K,
+    3)`` in metres; NaN for fewer than `MIN_SCENES`, or for a single keypoint.
     """
     count = len(keypoints)
     if len(demonstrated) < MIN_SCENES or count < 2:
@@ -200,21 +198,15 @@ def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
     pairs = np.triu_indices(count, 1)
     shown, new = (np.linalg.norm((p[..., :, None, :] - p[..., None, :, :]), axis=-1) for p in (demonstrated, keypoints))
     variation = robust_std(shown) + np.diag(np.full(count, np.inf))
-    nearest = np.argsort(variation, axis=1)[:, : min(NEAREST, count - 1)]
-    compared, joined = variation < RIGID_M, variation < RIGID_M
-    compared[np.arange(count)[:, None], nearest] = True
-    joined[np.arange(count), nearest[:, 0]] = True
+    joined = variation < RIGID_M
+    joined[np.arange(count), variation.argmin(axis=1)] = True
     _, thing = connected_components(coo_array(joined), directed=False)
-    compared = (compared | compared.T)[pairs]
-    shown, new, first, second = (
-        shown[:, *pairs][:, compared],
-        new[pairs][compared],
-        *(thing[i][compared] for i in pairs),
-    )
+    compared = (joined | joined.T)[pairs]
+    shown, new, of_thing = shown[:, *pairs][:, compared], new[pairs][compared], thing[pairs[0]][compared]
 
     def quartiles(distances: FloatArray, others: FloatArray) -> FloatArray:
         off = np.abs(distances - np.median(others, axis=0)) / np.maximum(robust_std(others), DISTANCE_M)
-        return np.array([np.quantile(off[(first == one) | (second == one)], 0.75) for one in range(thing.max() + 1)])
+        return np.array([np.quantile(off[of_thing == one], 0.75) for one in range(thing.max() + 1)])
 
     usual = np.median([quartiles(row, np.delete(shown, index, axis=0)) for index, row in enumerate(shown)], axis=0)
     return float((quartiles(new, shown) / np.maximum(usual, 1.0)).max())

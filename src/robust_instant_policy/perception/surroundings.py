@@ -1,0 +1,73 @@
+"""What all images show in and around an object: it tells its turn where its own points look the same after some.
+
+A horizontal grid in the object's frame. For each cell the images tell the chance that something stands there: a handle,
+a door or a lever of few points decides, where a mean over all of the object's points would not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.perception.view import FREE, OCCUPIED, View
+
+CELL_M = 0.006
+CONTEXT_M = 0.06  # around the object
+BLUR_CELLS = 0.7  # standard deviation
+LEAST_CHANCE = 0.12  # that a cell is not as in all images before
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """``evidence_of (3, n)``: for each of n ``cells (n, 2)``, horizontal places in the reference image's world, metres,
+    the logarithm of the chance of its state in an image (see `view.Ground`) against that of a coin; whether the motions
+    in the images include changes of size, ``stretch``.
+    """
+
+    cells: FloatArray
+    evidence_of: FloatArray
+    stretch: bool
+
+    @classmethod
+    def of(
+        cls, points: FloatArray, views: Sequence[View], motions: Sequence[FloatArray], stretch: bool
+    ) -> Surroundings:
+        """Of an object with ``points (N, 3)`` in the reference image, at its ``motions`` in ``views``."""
+        cells, shape = grid_around(points)
+        states = np.array([shown(cells, view, motion[None])[0] for view, motion in zip(views, motions, strict=True)])
+        return cls.from_states(cells, shape, states, stretch)
+
+    @classmethod
+    def from_states(
+        cls, cells: FloatArray, shape: tuple[int, int], states: NDArray[np.int8], stretch: bool
+    ) -> Surroundings:
+        """From the ``states (I, n)`` of ``cells (n, 2)`` of a grid of ``shape`` in I images."""
+        occupied, free = (states == OCCUPIED).sum(axis=0), (states == FREE).sum(axis=0)
+        chance = ((occupied + 0.5) / (occupied + free + 1)).reshape(shape)
+        chance = gaussian_filter(chance, BLUR_CELLS).clip(LEAST_CHANCE, 1 - LEAST_CHANCE).reshape(-1)
+        return cls(cells, np.log(2 * np.stack([np.full(len(cells), 0.5), 1 - chance, chance])), stretch)
+
+    def evidence(self, view: View, motions: FloatArray) -> FloatArray:
+        """Logarithms ``(C,)`` of the likelihood of what ``view`` shows around the object at ``motions (C, 4, 4)``."""
+        return self.evidence_in(shown(self.cells, view, motions))
+
+    def evidence_in(self, states: NDArray[np.int8]) -> FloatArray:
+        """The same of ``states (C, n)`` of the cells."""
+        return np.asarray(self.evidence_of[states, np.arange(len(self.cells))].sum(axis=1))
+
+
+def grid_around(points: FloatArray) -> tuple[FloatArray, tuple[int, int]]:
+    """Cells ``(n, 2)`` around an object with ``points (N, 3)``, metres, and the shape of their grid."""
+    lower, upper = points[:, :2].min(axis=0) - CONTEXT_M, points[:, :2].max(axis=0) + CONTEXT_M
+    axes = [np.arange(start, end, CELL_M) for start, end in zip(lower, upper, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2), (len(axes[0]), len(axes[1]))
+
+
+def shown(cells: FloatArray, view: View, motions: FloatArray) -> NDArray[np.int8]:
+    """What ``view`` shows at ``cells (n, 2)`` of the reference image under ``motions (C, 4, 4)``: states ``(C, n)``."""
+    return view.ground.at(cells @ np.swapaxes(motions[:, :2, :2], 1, 2) + motions[:, None, :2, 3])
