@@ -77,10 +77,13 @@ def place_sphere(cell: PandaCell, rng: np.random.Generator) -> list[Stroke]:
 
 
 def lift_peg_upright(cell: PandaCell, rng: np.random.Generator) -> list[Stroke]:
-    """Grasp the peg at its middle and put it upright at a place where the wrist can turn that far."""
+    """Grasp the peg at its middle and put it upright about a place where the wrist can turn that far.
+
+    Not at one and the same place, at which no person ends: paths that do seem to run backwards in time.
+    """
     backward, forward = pitched(-0.3, 0.0), pitched(1.22, 0.0)
     tool = make_pose(backward, place(cell.env.peg))
-    upright = make_pose(forward, (0.25, 0.0, cell.env.peg_half_length + 0.002))
+    upright = make_pose(forward, (*rng.uniform((0.23, -0.03), (0.27, 0.03)), cell.env.peg_half_length + 0.002))
     return [*grasp(tool, rng), hold(raised(upright, 0.08)), hold(upright, pause=0.3)]
 
 
