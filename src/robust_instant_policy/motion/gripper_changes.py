@@ -86,7 +86,9 @@ class Pace:
 def _waits(demonstration: Demonstration) -> list[tuple[float, float]]:
     """Seconds before and after each change of a gripper's state in which its fingertips hardly move."""
     trajectory = demonstration.trajectory
-    found = []
+    found: list[tuple[float, float]] = []
+    if len(trajectory) < 2:
+        return found
     for arm in range(trajectory.num_arms):
         points = trajectory.triplets[:, arm, 1:].mean(axis=1)
         speed = np.linalg.norm(np.diff(points, axis=0), axis=1)
