@@ -36,7 +36,7 @@ SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of
 MIN_TARGET_POINTS = round(MIN_OBJECT_M2 / TARGET_M**2)
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
-KEPT_COLOUR_M = 0.008  # distance in colour in every image, for an object that keeps its colours
+KEPT_COLOUR_M = 0.008  # median over images of the distance in colour, for an object that keeps its colours
 HAND_REACH_M = 0.05  # of an object's points, at which a place of the hand counts 1/e
 MIN_NEAR = 0.2
 HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
@@ -186,6 +186,9 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
         family = (_template_of(home, np.concatenate([pieces[i] for i in members]), seed),)
         models[number] = replace(models[number], family=family)
     things = [_complete(models, found, number, views, seed, number in handled) for number in range(len(models))]
+    if all(thing.worst_fitness < MIN_FITNESS for thing in things):  # do they have other colours in some images?
+        models = [replace(model, colour_cap=COLOUR_CAP_M) for model in models]
+        things = [_complete(models, found, number, views, seed, number in handled) for number in range(len(models))]
     shapes = [
         _shapes([thing.model for thing in things], [thing.registrations[i] for thing in things], view)
         for i, view in enumerate(views)
@@ -257,8 +260,8 @@ def _aligned(
             seen = Surroundings.from_states(cells, grid, others, stretch)
             chosen[i] = int((priors[i] + seen.evidence_in(states[i]) / EVIDENCE_SCALE).argmax())
     known = model.templates[0].xyzrgb
-    differences = [_colour_difference(known, views[i], poses[i][chosen[i]]) for i in range(1, len(views))]
-    if max(differences) < KEPT_COLOUR_M:
+    typical = np.median([_colour_difference(known, views[i], poses[i][chosen[i]]) for i in range(1, len(views))])
+    if typical < KEPT_COLOUR_M:
         model = replace(model, colour_cap=KEPT_COLOUR_CAP_M)
     aligned = [found[0]]
     for i in range(1, len(views)):
