@@ -274,3 +274,16 @@ def test_a_handle_without_depth_tells_how_a_chest_of_another_colour_is_turned():
         place, image, _ = scene(seed, side)
         errors = np.linalg.norm(in_the_chest(extractor.locate(image).keypoints, place) - known, axis=1)
         assert np.median(errors) < 0.02, (side, errors)
+
+
+def test_a_thing_of_another_colour_in_a_few_demonstrations_is_found_in_all():
+    rng = np.random.default_rng(3)
+    wood, blue = (190, 160, 110), (100, 135, 150)
+    middles = rng.uniform(-0.12, 0.12, (9, 2))
+    chests = [
+        [(x, y, 0.06, 0.08, (colour, colour))] for (x, y), colour in zip(middles, [wood] * 6 + [blue] * 3, strict=True)
+    ]
+    paths = [path_to(x, y) for x, y in middles]
+    extractor = KeypointExtractor(6).fit([photograph(chest) for chest in chests], paths)
+    off = extractor.keypoints_ - np.pad(middles, ((0, 0), (0, 1)))[:, None]
+    assert np.abs(off[..., :2]).max() < 0.08
