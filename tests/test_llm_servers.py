@@ -302,7 +302,7 @@ def test_odd_replies_with_an_answer_are_read(serve, name):
 def test_replies_without_an_answer_are_told_in_one_line(serve, body):
     server = serve(plain(lambda _: Response(body)))
     message = message_of(server, deadline_s=0.6)
-    if "gave no answer" in message:  # the machine is busy
+    if "its reply could not be read" not in message:  # the machine is busy
         message = message_of(server, deadline_s=10.0)
     assert "its reply could not be read" in message
 
