@@ -6,7 +6,7 @@ The features f_j are made from `Evidence` and are 0 where nothing speaks against
 to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A
 plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, do not
 predict each other, a thing has another shape than theirs, or the checks could not decide whether images and paths
-belong together, it is at most `UNKNOWN`.
+belong together, it is multiplied by `UNKNOWN`. The coefficient of ``unexplained`` was set by hand.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
     "constant": 3.85, "distortion": 1.66, "prediction": 1.88, "novelty": 1.08, "displacement": 1.34,
-    "precision": 1.03, "doubts": 1.0, "warnings": 1.48,
+    "precision": 1.03, "doubts": 1.0, "warnings": 1.48, "unexplained": 3.0,
 }  # fmt: skip
-UNKNOWN = 0.5  # the most that is claimed where the demonstrations cannot tell
+UNKNOWN = 0.5  # factor, and so the most that is claimed, where the demonstrations cannot tell
 
 UNKNOWN_NOTE = (
     "unchecked: the demonstrations cannot tell how well they predict a new scene (fewer than three, or all of one "
@@ -119,6 +119,7 @@ class Evidence:
             "displacement": self.displacement
             / max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision))),
             "precision": self.precision / GOOD_PRECISION_M,
+            "unexplained": self.unexplained / GOOD_PREDICTION_M,
         }
         ratios = {name: -float(np.log(max(ratio, 1.0))) for name, ratio in found.items() if np.isfinite(ratio)}
         return {**dict.fromkeys(found, 0.0), **ratios, "doubts": -float(self.doubts), "warnings": -float(self.warnings)}
@@ -131,7 +132,7 @@ def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEF
     score = coefficients["constant"] + sum(coefficients[name] * value for name, value in evidence.features().items())
     vote = evidence.vote if np.isfinite(evidence.vote) else 1.0
     probability = float(min(1.0, evidence.agreement / GOOD_AGREEMENT) * (1 + vote) / 2 / (1 + np.exp(-score)))
-    return min(probability, UNKNOWN) if evidence.unknown_notes else probability
+    return UNKNOWN * probability if evidence.unknown_notes else probability
 
 
 def doubts(findings: Sequence[Finding]) -> int:
