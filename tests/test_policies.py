@@ -212,7 +212,6 @@ SURE = Evidence(
         {"vote": 0.5},
         {"distortion": 2.9},
         {"prediction": 0.05},
-        {"unexplained": 0.05},
         {"novelty": 4.0},
         {"displacement": 0.04},
         {"precision": 0.04},

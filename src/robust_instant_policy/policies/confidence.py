@@ -6,7 +6,7 @@ The features f_j are made from `Evidence` and are 0 where nothing speaks against
 to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A
 plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, do not
 predict each other, a thing has another shape than theirs, or the checks could not decide whether images and paths
-belong together, it is multiplied by `UNKNOWN`. The coefficient of ``unexplained`` was set by hand.
+belong together, it is multiplied by `UNKNOWN`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
     "constant": 3.85, "distortion": 1.66, "prediction": 1.88, "novelty": 1.08, "displacement": 1.34,
-    "precision": 1.03, "doubts": 1.0, "warnings": 1.48, "unexplained": 3.0,
+    "precision": 1.03, "doubts": 1.0, "warnings": 1.48,
 }  # fmt: skip
 UNKNOWN = 0.5  # factor, and so the most that is claimed, where the demonstrations cannot tell
 
@@ -119,7 +119,6 @@ class Evidence:
             "displacement": self.displacement
             / max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision))),
             "precision": self.precision / GOOD_PRECISION_M,
-            "unexplained": self.unexplained / GOOD_PREDICTION_M,
         }
         ratios = {name: -float(np.log(max(ratio, 1.0))) for name, ratio in found.items() if np.isfinite(ratio)}
         return {**dict.fromkeys(found, 0.0), **ratios, "doubts": -float(self.doubts), "warnings": -float(self.warnings)}
