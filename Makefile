@@ -28,10 +28,13 @@ lint:
 # A single test: make test ARGS="tests/test_demo.py -k plan"
 test: export OMP_NUM_THREADS := 1
 test: export OPENBLAS_NUM_THREADS := 1
+test: unexport PYTHONDONTWRITEBYTECODE
 test: setup
 	@$(MAKE) --no-print-directory lint
-	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --cov --cov-report= $(ARGS)
-	@.venv/bin/python scripts/coverage_table.py
+	@rm -rf .coverage && mkdir .coverage
+	PYTHONPATH=$(CURDIR)/scripts/coverage COVERAGE_FOLDER=$(CURDIR)/.coverage \
+		.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
+	@.venv/bin/python scripts/coverage_table.py .coverage
 
 # The LeRobot plugins, in an environment of their own (6 GB): the commands of docs/lerobot.md as they stand there, and tests.
 LEROBOT := .venv-lerobot
@@ -41,4 +44,4 @@ lerobot: setup
 	.venv/bin/python scripts/lerobot_end_to_end.py --lerobot $(LEROBOT)
 
 clean:
-	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage .coverage.*
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage
