@@ -20,8 +20,8 @@ from robust_instant_policy.perception.registration import (
     find_rivals,
     fit_shape,
     horizontal_axes,
-    polish,
     refine,
+    refine_pose,
     rotated,
     settle_turn,
     vote_for_motions,
@@ -30,35 +30,35 @@ from robust_instant_policy.perception.registration import (
 from robust_instant_policy.perception.surroundings import Surroundings, grid_around, shown
 from robust_instant_policy.perception.view import MIN_OBJECT_M2, TARGET_M, UNRELATED, View, spread_out, subsample
 
-MAX_TEMPLATE_POINTS = 250
-MAX_TEMPLATE_CELLS = 80
+MAX_TEMPLATE_POINTS = 250  # of an object in one image
+MAX_TEMPLATE_CELLS = 80  # of its descriptors there
 SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of other points of the object
-MIN_TARGET_POINTS = round(MIN_OBJECT_M2 / TARGET_M**2)
+MIN_TARGET_POINTS = round(MIN_OBJECT_M2 / TARGET_M**2)  # of an image; with fewer nothing is registered in it
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
 KEPT_COLOUR_M = 0.008  # median over images of the distance in colour, for an object that keeps its colours
 HAND_REACH_M = 0.05  # of an object's points, at which a place of the hand counts 1/e
-MIN_NEAR = 0.2
+MIN_NEAR = 0.2  # of `_nearness`, for an object that the hand handles
 HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
-MAX_HAND_LOSS = 12.0
-ALIGNMENT_ROUNDS = 3
+MAX_HAND_LOSS = 12.0  # of the logarithm of the chance, by the hand's place at one event
+ALIGNMENT_ROUNDS = 3  # over all images, each aligned with the others
 EVIDENCE_SCALE = 8.0  # of the surroundings' evidence: neighbouring cells of the grid are not independent
 MIN_ADVANTAGE = 1.0  # of the logarithm of the chance, for a motion that replaces the one that ICP found
 MAX_RIVAL_LOSS = 6.0  # in units of RIVAL_SCALE, for a motion that the surroundings may speak for
 RIVAL_SCALE = 0.03  # of the score by which a motion is worse, for a weight of 1/e
-SAME_PLACE_M = 0.02
+SAME_PLACE_M = 0.02  # mean distance of an object's points under two motions, for the same place
 MIN_FITNESS = 0.15  # of an object's registration in every demonstration
 MIN_PART_FITNESS = 0.5  # median, of a part: things of one kind in other colours have 0.3, in the same 0.7
-MAX_OBJECTS = 30
+MAX_OBJECTS = 30  # with their parts
 SHAPE_REACH_M = 0.03  # from an object: greatest distance of points of a larger one of its kind
 SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
 MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
 PART_TURNS = np.deg2rad(np.arange(-60.0, 90.0, 30.0))  # of a part against its object
 MUCH_BETTER = 0.05  # of the score, by which an object's own registration overrules that with its parts
-MAX_PART_TRAVEL_M = 0.2
-TOUCH_M = 0.03
-MAX_SHARED_BY_PART = 0.6  # which touches its object
-MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one
+MAX_PART_TRAVEL_M = 0.2  # against its object
+TOUCH_M = 0.03  # between a part and its object in the reference image
+MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one,
+MAX_SHARED_BY_PART = 0.6  # and for a part, which touches its object
 
 
 NO_MOTIONS = np.zeros((0, 4, 4))
@@ -269,7 +269,9 @@ def _aligned(
         if (pose != one.pose).any():
             similarity = _similarity(model.templates, views[i], _similarities(model.templates, views[i]))
             source = model.templates[one.template].xyzrgb
-            pose, fitness, similar = polish(pose, source, views[i].target, similarity, views[i].hides, model.colour_cap)
+            pose, fitness, similar = refine_pose(
+                pose, source, views[i].target, similarity, views[i].hides, model.colour_cap
+            )
             one = Registration(pose, fitness, similar, one.template)
         aligned.append(one)
     agreed = np.array([states[k][chosen[k]] for k in range(len(views))])
@@ -632,7 +634,7 @@ def _decided(model: Model, found: Registration, view: View) -> Registration:
     if best:
         source = model.templates[found.template].xyzrgb
         measured = _similarity(model.templates, view, _similarities(model.templates, view))
-        pose, fitness, similarity = polish(pose, source, view.target, measured, view.hides, model.colour_cap)
+        pose, fitness, similarity = refine_pose(pose, source, view.target, measured, view.hides, model.colour_cap)
     return replace(
         found,
         pose=pose,

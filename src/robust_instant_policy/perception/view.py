@@ -29,15 +29,15 @@ from robust_instant_policy.trajectory import ACTION_DIM, Trajectory
 MAX_CENTRE_OFFSET = 0.4  # of the principal point from the image centre, of half the image
 SPACING_M = 0.003  # between points, where the image has as many: enough for millimetres, and fast
 UNBOUNDED = np.array([[-np.inf] * 3, [np.inf] * 3])  # metres
-MIN_STEADY_PIXELS = 100
+MIN_STEADY_PIXELS = 100  # with depth, of an image
 MIN_OBJECT_M2 = 1.5e-4  # of the image of an object
 MIN_OBJECT_POINTS = 12  # fewer have no shape
 MIN_DISTANCE_SMOOTHED = 4.0  # Mahalanobis distance of a flat point's smoothed colour from the table's,
 MIN_DISTANCE_POINT = 2.5  # and of its own colour, so that smoothing adds no border to objects
 SMOOTHING_PX = 5  # evens out the grain of the table
-COLOUR_SAMPLES = 1000
-TRIM_ROUNDS = 4
-TRIM_DEVIATIONS = 3.0
+COLOUR_SAMPLES = 1000  # pixels from which the table's colour is fitted
+TRIM_ROUNDS = 4  # in each of which colours are left out
+TRIM_DEVIATIONS = 3.0  # whose Mahalanobis distance is larger
 COLOUR_NOISE = 0.02  # standard deviation of the camera's noise in a colour channel, of a range of 1
 GAP_M = 0.015  # foreground points further apart in space belong to different pieces,
 GAP_PX = 3  # but those of pixels this near do not,
@@ -46,7 +46,7 @@ HIDDEN_M = 0.02  # behind the surface that the image shows there
 STRIP_M = 0.035  # that an arm or a rod above the table may hide between two pieces of one thing
 SAME_COLOUR = 0.2  # greatest difference of the mean colours of such pieces, of a range of 1
 MIN_TOLD_SHARE = 1 / 3  # of the size of an object: smaller pieces are noise
-MAX_TOLD = 3
+MAX_TOLD = 3  # of them that a note names
 SQUARE_M = 0.004  # edge of the squares of `Ground`,
 SQUARE_SPACINGS = 1.2  # or of this many distances between points, if that is more
 FILLED_PX = 8  # from things: greatest distance of pixels without a steady depth that belong to them
@@ -404,9 +404,12 @@ def _join_hidden(label: IntArray, points: FloatArray, usable: NDArray[np.bool_])
             one, other = one[apart], other[apart]
             near = np.linalg.norm((points[one] - points[other])[:, :2], axis=1) < HIDDEN_GAP_M
             joined.append(np.stack([label[one[near]], label[other[near]]], axis=1))
-    a, b = np.concatenate(joined).T
-    count = label.max() + 1
-    graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
+    _join(label, np.concatenate(joined))
+
+
+def _join(label: IntArray, pairs: IntArray) -> None:
+    """Number the pieces in ``label (N,)`` anew from 0, those that ``pairs (P, 2)`` of numbers connect as one."""
+    graph = coo_matrix((np.ones(len(pairs), dtype=bool), tuple(pairs.T)), shape=(label.max() + 1,) * 2)
     label[label >= 0] = connected_components(graph, directed=False)[1][label[label >= 0]]
 
 
@@ -451,11 +454,7 @@ def _join_behind(
         near = (label[one] != label[other]) & (np.linalg.norm(points[one] - points[other], axis=1) < STRIP_M)
         pairs.append(np.stack([label[one[near]], label[other[near]]], axis=1))
     alike = [(a, b) for a, b in np.unique(np.concatenate(pairs), axis=0) if abs(mean[a] - mean[b]).max() < SAME_COLOUR]
-    if alike:
-        a, b = np.transpose(alike)
-        count = label.max() + 1
-        graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
-        label[label >= 0] = connected_components(graph, directed=False)[1][label[label >= 0]]
+    _join(label, np.array(alike, dtype=np.intp).reshape(-1, 2))
 
 
 def _leave_out_small(label: IntArray, heights: FloatArray, pixels: IntArray, least: int) -> str:
