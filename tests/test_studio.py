@@ -22,7 +22,7 @@ from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.evaluation.scenes import SPLITS
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.policies import Proposal, Settings, build_context, locate
+from robust_instant_policy.policies import Proposal, Settings, locate
 from robust_instant_policy.sanity import check_demonstrations, errors
 from tests.conftest import NUM_DEMONSTRATIONS
 
@@ -350,12 +350,11 @@ def test_keys_move_either_of_two_arms(studio):
     studio.banner("Your turn")
 
 
-def test_the_t_regression_ignores_a_candidate_that_is_dragged_away_and_the_gaussian_follows_it(workbench):
+def test_the_t_regression_ignores_a_candidate_that_is_dragged_away_and_the_gaussian_follows_it(context, workbench):
     from robust_instant_policy.studio.drawing import spread, tool_path
     from robust_instant_policy.studio.planner import Choices, Draft
 
     settings = Settings()
-    context = build_context(load_demonstrations(workbench / "data" / "push-cube"), settings)
     scene = locate(context, Observation.load(workbench / "observation.npz"))
     candidates = context.prompt.for_scene(scene.keypoints).carried_over(scene.keypoints, 5)
     draft = Draft(context, scene, settings, Proposal(candidates), "")
