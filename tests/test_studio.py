@@ -31,6 +31,12 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 KEYS = {"x": "lj", "y": "ik", "z": "uo"}  # forward and back
 SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 PATIENCE_S = 120.0  # of a busy machine
+# The page draws as often as it can, which takes a processor of its own where there is no GPU.
+DRAW_SELDOM = """
+const draw = window.requestAnimationFrame;
+window.requestAnimationFrame = (frame) => setTimeout(draw, 200, frame);
+window.cancelAnimationFrame = clearTimeout;
+"""
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium; run: make setup (Debian), or install one")
 
@@ -46,6 +52,7 @@ class Studio:
 
     def another_view(self):
         view = self.browser.new_page(viewport={"width": 900, "height": 600})
+        view.add_init_script(DRAW_SELDOM)
         view.goto(self.address)
         return view
 
