@@ -47,6 +47,7 @@ HAND_REACH_M = 0.05  # of an object's points, at which a place of the hand count
 MIN_NEAR = 0.2  # of that count, from which on the hand handles an object
 HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
 MAX_HAND_LOSS = 12.0  # of the logarithm of a motion's chance, for one place of the hand
+HANDLED_ADVANTAGE = 0.15  # in the score, for points that two objects explain
 ALIGNMENT_ROUNDS = 3  # over all demonstrations
 MIN_FITNESS = 0.15  # of an object's registration in every demonstration
 MIN_PART_FITNESS = 0.5  # median, of a part: things of one kind in other colours have 0.3, in the same 0.7
@@ -247,12 +248,12 @@ def _complete(
     handled: Collection[int],
 ) -> RigidObject:
     """Object ``number`` with templates from all views, and registered with them; the best views come first. Those that
-    are ``handled`` stay where the hand tells, and the others yield to them.
+    are ``handled`` stay where the hand tells, and others that fit about as well yield to them.
     """
     model, registrations = models[number], [row[number] for row in found]
     templates = list(model.templates)
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
-        rank = [(k in handled, one.score) for k, one in enumerate(found[i])]
+        rank = [one.score + HANDLED_ADVANTAGE * (k in handled) for k, one in enumerate(found[i])]
         better = [k for k in range(len(models)) if rank[k] > rank[number]]
         taken = explained(models, found[i], better)
         start = registrations[i].pose[None]
