@@ -47,10 +47,9 @@ HAND_REACH_M = 0.05  # of an object's points, at which a place of the hand count
 MIN_NEAR = 0.2  # of that count, from which on the hand handles an object
 HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
 MAX_HAND_LOSS = 12.0  # of the logarithm of a motion's chance, for one place of the hand
-HANDLED_ADVANTAGE = 0.15  # in the score, for points that two objects explain
 ALIGNMENT_ROUNDS = 3  # over all demonstrations
 MIN_FITNESS = 0.15  # of an object's registration in every demonstration
-MIN_PART_FITNESS = 0.5  # median, of a part: things of one kind in other colours have 0.3, in the same 0.7
+SAME_THING_FITNESS = 0.5  # things of one kind in other colours have 0.3, in the same 0.7
 MAX_OBJECTS = 30
 SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
 MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
@@ -230,7 +229,7 @@ def _split(
             if pairs[-1][1].fitness < MIN_FITNESS:
                 break
         fitness = [own.fitness for _, own in pairs]
-        if min(fitness) < MIN_FITNESS or np.median(fitness) < MIN_PART_FITNESS:
+        if min(fitness) < MIN_FITNESS or np.median(fitness) < SAME_THING_FITNESS:
             continue
         share, metres = gain(home.points[piece[part]], views, motions, [own.pose for _, own in pairs])
         # Not the largest share, which half of the part has as well as all of it.
@@ -248,12 +247,12 @@ def _complete(
     handled: Collection[int],
 ) -> RigidObject:
     """Object ``number`` with templates from all views, and registered with them; the best views come first. Those that
-    are ``handled`` stay where the hand tells, and others that fit about as well yield to them.
+    are ``handled`` stay where the hand tells, and others yield to them where they fit.
     """
     model, registrations = models[number], [row[number] for row in found]
     templates = list(model.templates)
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
-        rank = [one.score + HANDLED_ADVANTAGE * (k in handled) for k, one in enumerate(found[i])]
+        rank = [(k in handled and one.fitness > SAME_THING_FITNESS, one.score) for k, one in enumerate(found[i])]
         better = [k for k in range(len(models)) if rank[k] > rank[number]]
         taken = explained(models, found[i], better)
         start = registrations[i].pose[None]

@@ -42,7 +42,7 @@ DISTORTED = 3.0  # `Evidence.distortion` above which a thing is another one than
 
 UNEXPLAINED_M = 0.06  # `Evidence.unexplained` above which it is not known what demonstrations have in common
 
-RECOGNISED = 0.8  # of the least confidence among demonstrations, from which on a scene counts as recognised
+RECOGNISED = 0.7  # of the least confidence in demonstrations, from which on a scene counts as recognised
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
 # Up to these values evidence says nothing: sound scenes have them.
 GOOD_DISTORTION = 2.0
@@ -216,10 +216,12 @@ def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
 def recognition(demonstrated: FloatArray, keypoint_confidence: FloatArray) -> float:
     """How far a scene was recognised, in [0, 1], from the confidence ``(K,)`` of its keypoints.
 
-    It is compared with that of the demonstrations, ``demonstrated (I, K)``, of which the first is the reference that
-    the others are recognised by; with fewer than two there is nothing to compare, and it is 1. The lower quartile
-    counts: one keypoint may be hidden, but an object that is missing has several.
+    Each is compared with the least that it has in the demonstrations, ``demonstrated (I, K)``, of which the first is
+    the reference that the others are recognised by; with fewer than two there is nothing to compare, and it is 1. The
+    lower quartile counts: one keypoint may be hidden, but an object that is missing has several.
     """
-    usual = np.quantile(demonstrated[1:], 0.25, axis=1)
-    least = RECOGNISED * float(usual.min()) if len(usual) else 0.0
-    return min(1.0, float(np.quantile(keypoint_confidence, 0.25)) / least) if least > 0 else 1.0
+    if len(demonstrated) < 2:
+        return 1.0
+    least = RECOGNISED * demonstrated[1:].min(axis=0)
+    ratio = np.divide(keypoint_confidence, least, out=np.ones_like(keypoint_confidence), where=least > 0)
+    return min(1.0, float(np.quantile(ratio, 0.25)))
