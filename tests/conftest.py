@@ -9,9 +9,13 @@ from pathlib import Path
 
 import pytest
 from filelock import FileLock
+from hypothesis import settings
 
 from robust_instant_policy.cli import main
 from robust_instant_policy.datasets import load_demonstrations
+
+settings.register_profile("busy machine", deadline=None)
+settings.load_profile("busy machine")
 
 NUM_DEMONSTRATIONS = 5
 # These files take the most time. They come first, so that all workers end at about the same time.
