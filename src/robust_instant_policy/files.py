@@ -10,6 +10,7 @@ import os
 import secrets
 import shutil
 import stat
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -65,14 +66,28 @@ def read_json(path: str | Path, kind: str = "a JSON object") -> dict[str, Any]:
             text = file.read(MAX_JSON_BYTES + 1)
         if len(text) > MAX_JSON_BYTES:
             raise DatasetError(f"{path} is larger than {MAX_JSON_BYTES >> 20} MiB, too large for such a file")
-        content = json.loads(text.decode())
+        content = parse_json(text)
     except FileNotFoundError:
         raise DatasetError(f"{path} is missing; restore it, or write it again") from None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise DatasetError(f"{path} is not {kind}: it cannot be read as JSON; restore it, or write it again") from error
     if not isinstance(content, dict):
         raise DatasetError(f"{path} is not {kind}: it must hold a JSON object; restore it, or write it again")
     return content
+
+
+def parse_json(text: str | bytes) -> Any:
+    """What ``text`` from outside holds. Raises `ValueError`, also for deep nesting and for integers beyond a float."""
+    try:
+        return json.loads(text, parse_int=_whole)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > sys.float_info.max_10_exp:
+        raise ValueError(f"an integer of {len(digits)} digits")
+    return int(digits)
 
 
 def _checked_name(path: str | Path) -> str | Path:
