@@ -12,6 +12,7 @@ from robust_instant_policy.perception.efficientnet import EfficientNetDescriptor
 from robust_instant_policy.pointcloud import in_metres
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.tasks.camera_noise import CameraNoise
+from robust_instant_policy.trajectory import Trajectory
 from tests.pages import Page
 
 CAMERA_HEIGHT = 1.0
@@ -137,6 +138,26 @@ def test_confidence_is_lower_where_the_object_is_gone(extractor):
     depth[60:140, 60:140] = CAMERA_HEIGHT - 0.15
     other = extractor.locate(Observation(rgb, depth, stranger.intrinsics, stranger.camera_pose))
     assert np.median(other.confidence) < np.median(there.confidence) - 0.2
+
+
+def test_a_second_thing_of_the_same_look_is_told_and_a_stranger_is_not(extractor):
+    first, second = Scene(-0.12, 0.1, 20).observation, Scene(0.14, -0.08, -30)
+    there = second.parts == 1
+    rgb, depth = first.rgb.copy(), first.depth.copy()
+    rgb[there], depth[there] = second.observation.rgb[there], second.observation.depth[there]
+    both = extractor.locate(Observation(rgb, depth, first.intrinsics, first.camera_pose))
+    assert both.doubled == (0,)
+    assert any("looks like object 0" in note for note in both.notes)
+    rgb[there] = (90, 30, 120)
+    depth[there] -= 0.03
+    assert extractor.locate(Observation(rgb, depth, first.intrinsics, first.camera_pose)).doubled == ()
+
+
+@pytest.mark.parametrize(("arms", "words"), [((1,), "2 images and 1 paths"), ((1, 2), "paths of 1 and 2 arms")])
+def test_paths_that_do_not_belong_to_the_images_are_refused(demonstrations, arms, words):
+    paths = [Trajectory.from_actions(np.zeros((3, 10 * count))) for count in arms]
+    with pytest.raises(KeypointError, match=words):
+        KeypointExtractor(features="efficientnet").fit([one.observation for one in demonstrations[:2]], paths)
 
 
 def test_depth_in_millimetres_is_detected_and_told(demonstrations, extractor):

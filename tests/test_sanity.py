@@ -186,6 +186,20 @@ def test_demonstrations_that_do_not_belong_together_are_refused(demonstrations, 
         check_demonstrations(FAULTS[fault].demonstrations(demonstrations)).raise_if_wrong()
 
 
+def test_depth_that_is_missing_where_the_gripper_works_or_a_thing_may_be_is_told(report, demonstrations, scene):
+    blind = FAULTS["no-depth-at-grasps:demos"].demonstrations
+    count = len(demonstrations)
+    for some, severity in ((demonstrations, "warning"), (demonstrations[:1], "unchecked")):
+        shown = [*blind(some), *demonstrations[len(some) :]]
+        (hole,) = [finding for finding in check_demonstrations(shown).findings if finding.kind == "hole"]
+        assert hole.severity == severity
+        assert f"in {len(some)} of {count} demonstrations" in hole.message
+    found = report.check_observation(FAULTS["no-depth-on-a-thing:scene"].scene(scene, demonstrations))
+    (hole,) = [finding for finding in found if finding.kind == "hole"]
+    assert hole.severity == "warning"
+    assert re.search(r"a hole, \d+ mm wide, at pixel \(\d+, \d+\)", hole.message)
+
+
 def test_states_inverted_while_pushing_are_doubted(demonstrations):
     inverted = FAULTS["state-inverted:demos"].demonstrations(demonstrations)
     assert any("are its states inverted" in note for note in check_demonstrations(inverted).notes)
