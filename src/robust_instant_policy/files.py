@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import grp
+import hashlib
 import json
 import os
+import pwd
 import secrets
 import shutil
 import stat
@@ -88,6 +91,32 @@ def _whole(digits: str) -> int:
     if len(digits) > sys.float_info.max_10_exp:
         raise ValueError(f"an integer of {len(digits)} digits")
     return int(digits)
+
+
+def sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def others_can_write(path: Path, in_own_group: bool = True) -> bool:
+    """Whether another user could exchange a file, or one in a folder, between its check and its use.
+
+    Many systems make files writable for a group of which their owner is the only member; without ``in_own_group`` that
+    counts as nobody.
+    """
+    status = path.stat()
+    if status.st_uid not in (0, os.geteuid()) or status.st_mode & stat.S_IWOTH:
+        return True
+    return bool(status.st_mode & stat.S_IWGRP) and (in_own_group or not _is_own_group(status.st_gid))
+
+
+def _is_own_group(number: int) -> bool:
+    """Whether a group is that of this user alone."""
+    try:
+        group, user = grp.getgrgid(number), pwd.getpwuid(os.geteuid())
+    except KeyError:
+        return False
+    return group.gr_name == user.pw_name and not set(group.gr_mem) - {user.pw_name}
 
 
 def _checked_name(path: str | Path) -> str | Path:
