@@ -398,6 +398,11 @@ def half_hidden(o: Observation) -> Observation:
     return replace(o, rgb=rgb, depth=depth)
 
 
+def turned_camera(o: Observation, degrees: float) -> Observation:
+    turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    return replace(o, camera_pose=o.camera_pose @ make_pose(turn, (0, 0, 0)))
+
+
 def raised_pixels(o: Observation) -> tuple[FloatArray, FloatArray]:
     """Rows and columns of the pixels that stand above the table."""
     table = float(np.median(o.depth[o.depth > 0]))
@@ -610,6 +615,9 @@ def _faults() -> dict[str, Fault]:
     for count in (1, 2, 3):
         add(f"first-{count}:demos", (), demonstrations=first(count))
     add("neighbouring-4:demos", ("outside",), demonstrations=neighbouring(4))
+    add("pitch-1deg:scene", ("said to be",), scene=lambda o, _: turned_camera(o, 1.0))
+    add("depth-8-bit:scene", ("8 bits",), scene=lambda o, _: replace(o, depth=np.rint(o.depth * 127) / np.float32(127)))
+    add("grey:scene", ("infrared",), scene=lambda o, _: replace(o, rgb=o.rgb[..., [1, 1, 1]]))
     add("half-hidden:scene", ("recognised",), scene=lambda o, _: half_hidden(o))
     add("no-depth-at-grasps:demos", ("depth",), demonstrations=lambda ds: list(map(no_depth_at_grasps, ds)))
     add("no-depth-on-a-thing:scene", ("depth",), scene=lambda o, _: no_depth_on_a_thing(o))

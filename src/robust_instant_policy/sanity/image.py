@@ -13,6 +13,7 @@ from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.view import View
 
 MIN_READINGS = 0.05  # share of the pixels that must have a steady depth
+COARSE = 0.005  # of the median depth: a greater smallest difference between readings comes from no camera
 UNIFORM = 3.0  # of 255; a colour image that varies less shows nothing
 SQUARE_PIXELS = 0.1  # relative difference of fx and fy that no camera has
 CENTRED = 0.2  # of the image's size that the principal point may lie from its middle
@@ -52,11 +53,19 @@ def check_image(view: View) -> list[Finding]:
     if (median := float(np.median(raw))) > MILLIMETRES_ABOVE:
         words = f"depth has a median of {median:.0f}: it is in millimetres, and read as such; store metres"
         found.append(Finding("depth unit", "warning", words, {"median": median}, "millimetres"))
+    if (step := float(np.diff(np.unique(raw)).min(initial=np.inf))) > COARSE * median and np.isfinite(step):
+        words = f"depth has {len(np.unique(raw))} levels only, at least {step:.3g} apart: was it stored in 8 bits?"
+        found.append(Finding("depth levels", "warning", words, {"step": step}, "8 bits"))
     if (spread := float(view.rgb.std())) < UNIFORM:
         words = (
             f"the colour image is all the same (deviation {spread:.1f} of 255): is the lens covered, or the stream off?"
         )
         found.append(Finding("colour", "error", words, {"deviation": spread}, "black image"))
+    elif (observation.rgb == observation.rgb[..., :1]).all():
+        words = (
+            "the colour image has shades of grey only: is it the infrared stream? things of other colours look alike"
+        )
+        found.append(Finding("colour", "warning", words, cause="infrared"))
     if view.camera_height <= 0:
         words = f"the camera lies {-view.camera_height:.2f} m below the table that it sees"
         found.append(Finding("camera pose", "error", words, {"camera_height": view.camera_height}))
