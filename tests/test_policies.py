@@ -233,7 +233,7 @@ def test_a_tie_or_an_error_of_a_check_leaves_no_confidence():
 
 
 @pytest.mark.parametrize(
-    "unknown", [{"prediction": np.nan}, {"novelty": np.nan}, {"undecided": 1}, {"distortion": 3.5}]
+    "unknown", [{"prediction": np.nan}, {"novelty": np.nan}, {"undecided": 1}, {"distortion": 3.5}, {"doubled": 1}]
 )
 def test_what_cannot_be_known_bounds_the_confidence(unknown):
     assert 0.4 < plan_confidence(replace(SURE, **unknown)) < UNKNOWN

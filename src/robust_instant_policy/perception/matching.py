@@ -12,6 +12,7 @@ from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.perception.descriptors import IntArray
 from robust_instant_policy.perception.models import (
     NO_MOTIONS,
+    NOT_FOUND,
     Model,
     Registration,
     Template,
@@ -45,6 +46,7 @@ PART_TURNS = np.deg2rad(np.arange(-60.0, 90.0, 30.0))  # of a part against its o
 MUCH_BETTER = 0.05  # of the score, by which an object's own registration overrules that with its parts
 MAX_PART_TRAVEL_M = 0.2
 MAX_SHARED_BY_PART = 0.6  # which touches its object
+LEFT_OF_TWIN = 0.5  # share of an object's surface that an image shows of a second thing of its look
 MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one
 
 
@@ -134,7 +136,7 @@ def register(
         target = target[~within(target[:, :3], taken, CLAIM_M)]
         free = np.flatnonzero(~within(view.cell_points, taken, CLAIM_M))
         if len(target) < MIN_TARGET_POINTS or not len(free):
-            return Registration(np.eye(4), 0.0, 0.0, 0)
+            return NOT_FOUND
     similar = similarities(templates, view)
     with_foreground = [table[:, free] for table in similar]
     matches, goals = np.concatenate(with_foreground), view.cell_points[free]
@@ -156,6 +158,23 @@ def register(
     refined = refine(candidates, source, target, similarity, view.hides, colour_cap)
     pose = settle_turn(refined.motions[0], source, target, similarity, view.hides, colour_cap)
     return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index, refined.motions[1:])
+
+
+def find_again(models: Sequence[Model], found: Sequence[Registration], view: View) -> list[Registration]:
+    """Each object in what no object explains of ``view``: a second thing of its look has about the score of the first.
+
+    Parts are not looked for, nor objects with more points than are left.
+    """
+    taken = explained(models, found, range(len(models)))
+    left = int((~within(view.target[:, :3], taken, CLAIM_M)).sum()) if len(taken) else len(view.target)
+    again = []
+    for model, one in zip(models, found, strict=True):
+        size = len(model.templates[one.template].surface)
+        if model.parent >= 0 or left < max(MIN_TARGET_POINTS, LEFT_OF_TWIN * size):
+            again.append(NOT_FOUND)
+        else:
+            again.append(register(model.templates, view, taken, colour_cap=model.colour_cap))
+    return again
 
 
 def explained(

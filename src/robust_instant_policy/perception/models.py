@@ -47,6 +47,7 @@ class Registration:
 
 
 IN_REFERENCE = Registration(np.eye(4), 1.0, 1.0, 0)
+NOT_FOUND = Registration(np.eye(4), 0.0, 0.0, 0)
 
 
 @dataclass(frozen=True, eq=False)
