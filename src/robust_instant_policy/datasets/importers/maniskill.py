@@ -76,7 +76,7 @@ def _read_episode(
     return SourceEpisode(
         name=f"{path.name} ({name})",
         rgb=None if images is None else images[0],
-        depth=None if depth is None else as_numbers("depth", depth[0, ..., 0], np.float32) * MILLIMETRE,
+        depth=None if depth is None else as_numbers("depth", depth[0, ..., 0], np.float32) * np.float32(MILLIMETRE),
         intrinsics=intrinsics,
         camera_pose=None if extrinsics is None else invert_pose(np.vstack([extrinsics, [0, 0, 0, 1]])),
         poses=None if tcp is None else poses_of(f"{path} ({name})", tcp, XYZ_WXYZ),
