@@ -50,7 +50,7 @@ from robust_instant_policy.perception import (
 from robust_instant_policy.perception.accuracy import Accuracy
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.efficientnet import load_network
-from robust_instant_policy.perception.objects import register_all
+from robust_instant_policy.perception.matching import register_all
 from robust_instant_policy.perception.settings import DescriptorSettings
 from robust_instant_policy.perception.view import make_view
 from robust_instant_policy.perception.vit import VitDescriptors

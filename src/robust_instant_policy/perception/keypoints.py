@@ -16,18 +16,11 @@ from robust_instant_policy.errors import InvalidValueError, KeypointError, Unkno
 from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
+from robust_instant_policy.perception.matching import certainty, register_all
+from robust_instant_policy.perception.models import Registration, RigidObject
 from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
-from robust_instant_policy.perception.objects import (
-    MIN_FITNESS,
-    Registration,
-    RigidObject,
-    certainty,
-    find_objects,
-    register_all,
-    segmentation,
-    without,
-)
+from robust_instant_policy.perception.objects import MIN_FITNESS, find_objects, segmentation, without
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
 from robust_instant_policy.perception.relevance import hand_places, relevances, shares, still
 from robust_instant_policy.perception.selection import best_buddies, select_points

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 
 from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.descriptors import IntArray
-from robust_instant_policy.perception.view import GAP_M, View, connected_pieces
+from robust_instant_policy.perception.pieces import GAP_M, connected_pieces
+from robust_instant_policy.perception.view import View
 
 UNEXPLAINED_M = 0.008  # distance from the surfaces of the other images
 PERCENTILE = 75.0  # over the images: a part need not move in all of them

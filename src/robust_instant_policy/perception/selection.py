@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import IntArray
-from robust_instant_policy.perception.objects import RigidObject
+from robust_instant_policy.perception.models import RigidObject
 from robust_instant_policy.perception.view import View
 
 SEEN_M = 0.008  # from the surface: greatest distance of a point that is seen in an image

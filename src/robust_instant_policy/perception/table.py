@@ -1,4 +1,4 @@
-"""The table in an image: its plane, and where it ends."""
+"""The table in an image: its plane, where it ends, and its colour."""
 
 from __future__ import annotations
 
@@ -9,8 +9,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from robust_instant_policy.geometry import MAD_TO_STD, FloatArray, make_pose
+from robust_instant_policy.perception.descriptors import Float32Array
 from robust_instant_policy.pointcloud import table_plane
 
+COLOUR_SAMPLES = 1000  # pixels of the table from which its colour is fitted,
+TRIM_ROUNDS = 4  # in so many rounds, each without the pixels
+TRIM_DEVIATIONS = 3.0  # beyond this Mahalanobis distance
+COLOUR_NOISE = 0.02  # standard deviation of the camera's noise in a colour channel, of a range of 1
 MIN_HEIGHT_M = 0.010  # above the table, for points of objects,
 MIN_HEIGHT_DEVIATIONS = 4.0  # or this many standard deviations of the depth noise, if that is more
 BELOW_M = 0.05  # a ray that ends this far under the plane has passed the table
@@ -75,3 +80,33 @@ def levelling(plane: FloatArray) -> FloatArray:
     a, b, c, _ = plane
     cross = np.array([[0, 0, -a], [0, 0, -b], [a, b, 0.0]])
     return make_pose(np.eye(3) + cross + cross @ cross / (1 + c), [0, 0, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class TableColour:
+    """Gaussian of the table's colours in [0, 1]: ``mean (3,)``; ``whitening (3, 3)`` maps to unit covariance."""
+
+    mean: Float32Array
+    whitening: Float32Array
+
+    @classmethod
+    def fit(cls, colours: Float32Array) -> TableColour:
+        """Fitted to ``colours (N, 3)``, outliers trimmed."""
+        colours = colours[:: max(1, len(colours) // COLOUR_SAMPLES)]
+        for _ in range(TRIM_ROUNDS):
+            covariance = np.cov(colours.T) + COLOUR_NOISE**2 * np.eye(3)
+            whitening = np.linalg.inv(np.linalg.cholesky(covariance)).T.astype(np.float32)
+            table = cls(np.median(colours, axis=0), whitening)
+            colours = colours[table._mahalanobis(colours) < TRIM_DEVIATIONS]
+        return table
+
+    def distance(self, colours: Float32Array) -> Float32Array:
+        """Mahalanobis distances ``(N,)`` of ``colours (N, 3)``, each first scaled up to the table's brightness.
+
+        A shadow has the table's colour, darker.
+        """
+        brightness = np.maximum(colours.mean(axis=1), COLOUR_NOISE)
+        return self._mahalanobis(colours * np.maximum(self.mean.mean() / brightness, 1)[:, None])
+
+    def _mahalanobis(self, colours: Float32Array) -> Float32Array:
+        return np.sqrt((((colours - self.mean) @ self.whitening) ** 2).sum(axis=1))

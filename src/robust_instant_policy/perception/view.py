@@ -8,9 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation, binary_fill_holes, distance_transform_edt, uniform_filter
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import KeypointError
@@ -22,7 +19,26 @@ from robust_instant_policy.perception.descriptors import (
     Float32Array,
     IntArray,
 )
-from robust_instant_policy.perception.table import Table, levelling
+from robust_instant_policy.perception.pieces import (
+    BELOW,
+    BESIDE,
+    BORDER,
+    GAP_M,
+    GAP_PX,
+    HAND,
+    HIGH,
+    HOVERING_M,
+    OUTSIDE,
+    TABLE,
+    UNKNOWN,
+    connected_pieces,
+    cubes,
+    join_behind,
+    join_hidden,
+    leave_out_arms,
+    leave_out_small,
+)
+from robust_instant_policy.perception.table import Table, TableColour, levelling
 from robust_instant_policy.pointcloud import in_metres, steady
 from robust_instant_policy.trajectory import ACTION_DIM, Trajectory
 
@@ -35,18 +51,7 @@ MIN_OBJECT_POINTS = 12  # fewer have no shape
 MIN_DISTANCE_SMOOTHED = 4.0  # Mahalanobis distance of a flat point's smoothed colour from the table's,
 MIN_DISTANCE_POINT = 2.5  # and of its own colour, so that smoothing adds no border to objects
 SMOOTHING_PX = 5  # evens out the grain of the table
-COLOUR_SAMPLES = 1000
-TRIM_ROUNDS = 4
-TRIM_DEVIATIONS = 3.0
-COLOUR_NOISE = 0.02  # standard deviation of the camera's noise in a colour channel, of a range of 1
-GAP_M = 0.015  # foreground points further apart in space belong to different pieces,
-GAP_PX = 3  # but those of pixels this near do not,
-HIDDEN_GAP_M = 0.020  # nor those of such pixels this near in a horizontal direction: sides may be hidden from above
 HIDDEN_M = 0.02  # behind the surface that the image shows there
-STRIP_M = 0.035  # that an arm or a rod above the table may hide between two pieces of one thing
-SAME_COLOUR = 0.2  # greatest difference of the mean colours of such pieces, of a range of 1
-MIN_TOLD_SHARE = 1 / 3  # of the size of an object: smaller pieces are noise
-MAX_TOLD = 3
 SQUARE_M = 0.004  # edge of the squares of `Ground`,
 SQUARE_SPACINGS = 1.2  # or of this many distances between points, if that is more
 FILLED_PX = 8  # from things: greatest distance of pixels without a steady depth that belong to them
@@ -54,8 +59,6 @@ FILLED_SMOOTHING_PX = 3
 TARGET_M = 0.005  # edge of the cubes with one point each in `View.target`
 COLOUR_SCALE_M = 0.06  # metres in an XYZRGB point for the difference between black and white in one channel
 MIN_TILT_RAD = np.deg2rad(1.0)  # of the table in the world; less is the noise of its plane
-BORDER_SHARE = 0.01  # of the image's width and height, at its border
-HOVERING_M = 0.06  # above the table where it crosses the image's border: an arm or a person
 TALLEST_M = 0.8  # of what stands on a table
 DEEPEST_M = 0.3  # of a hole in a table: what is lower is the floor under it
 
@@ -63,23 +66,6 @@ HAND_SHARE = 0.5  # of the distance from the gripper point to the fingertips: wh
 TOLD_BORDER_SHARE = 0.01  # of the image, that something at its border covers
 
 FREE, OCCUPIED = 1, 2
-TABLE, BELOW, BESIDE, HIGH, BORDER, SMALL, OUTSIDE, UNKNOWN, UNRELATED, HAND = range(-1, -11, -1)
-REASONS = {
-    TABLE: "table",
-    BELOW: "below the table",
-    BESIDE: "beside the table",
-    HIGH: "too high for a thing on the table",
-    BORDER: "reaches in over the image's border, as an arm does",
-    SMALL: "too small",
-    OUTSIDE: "outside the workspace",
-    UNKNOWN: "no steady depth",
-    UNRELATED: "no object that all demonstrations show",
-    HAND: "the gripper where the demonstrations start",
-}
-CUT_OFF_NOTE = (
-    "all that stands on the table reaches over the image's border: it is taken for the task's object, not for an arm; "
-    "show the whole of it, and park the arm outside the image"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,14 +217,14 @@ def make_view(
         observation = replace(observation, camera_pose=to_level @ observation.camera_pose)
     foreground = np.flatnonzero(label == 0)
     label[foreground] = connected_pieces(points[foreground], max(GAP_M, GAP_PX * stride * pixel_m))
-    _join_hidden(label, points, usable)
+    join_hidden(label, points, usable)
     label[(label >= 0) & np.isin(label, label[of_hand])] = HAND
-    cut_off = _leave_out_arms(label, heights, pixels, least)
+    cut_off = leave_out_arms(label, heights, pixels, least)
     # Above the table, be it left out for that or for being outside the workspace.
     over = np.zeros(usable.shape, dtype=bool)
     over[usable] = np.isin(label, (BORDER, HIGH, HAND)) | ((label == OUTSIDE) & (heights > HOVERING_M))
-    _join_behind(label, points, usable, over, observation.rgb[pixels[:, 1], pixels[:, 0]] / 255)
-    small = _leave_out_small(label, heights, pixels, least)
+    join_behind(label, points, usable, over, observation.rgb[pixels[:, 1], pixels[:, 0]] / 255)
+    small = leave_out_small(label, heights, pixels, least)
 
     labels = np.full(usable.shape, UNKNOWN, dtype=np.int16)
     labels[usable] = label
@@ -300,7 +286,7 @@ def subsample(indices: IntArray, count: int, seed: int) -> IntArray:
 
 def spread_out(points: ArrayLike) -> IntArray:
     """Numbers of one of ``points (N, 3)``, metres, in each cube with edges of `TARGET_M`."""
-    return np.unique(_cubes(np.asarray(points), TARGET_M), return_index=True)[1]
+    return np.unique(cubes(np.asarray(points), TARGET_M), return_index=True)[1]
 
 
 def _filled(
@@ -322,13 +308,6 @@ def _filled(
     rows, cols = nearest[:, asked] * stride
     pixels = np.argwhere(asked)[:, ::-1] * stride
     return lift(pixels, depth[rows, cols], observation.intrinsics, observation.camera_pose)
-
-
-def _cubes(points: FloatArray, edge: float) -> IntArray:
-    """Number ``(N,)`` of the cube with this ``edge``, metres, in which each of ``points (N, 3)`` lies."""
-    number = np.floor(points / edge).astype(np.intp)
-    number -= number.min(axis=0)
-    return np.ravel_multi_index(tuple(number.T), tuple(number.max(axis=0) + 1))
 
 
 def _cell_points(cells: IntArray, label: IntArray, points: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -370,138 +349,3 @@ def _unlike_table(
     colour = TableColour.fit(colours[flat] if flat.any() else colours)
     unlike = (colour.distance(smoothed) > MIN_DISTANCE_SMOOTHED) & (colour.distance(colours) > MIN_DISTANCE_POINT)
     return raised | (flat & unlike & (descriptors.saliency.flat[descriptors.cells_at(pixels)] > salient))
-
-
-def connected_pieces(points: FloatArray, gap: float) -> IntArray:
-    """Number ``(N,)`` of the piece of each of ``points (N, 3)``: chains of points less than ``gap`` apart."""
-    if not len(points):
-        return np.zeros(0, dtype=np.intp)
-    _, voxel, counts = np.unique(_cubes(points, gap / 3), return_inverse=True, return_counts=True)
-    centres = np.stack([np.bincount(voxel, axis) for axis in points.T], axis=1) / counts[:, None]
-    a, b = cKDTree(centres).query_pairs(gap, output_type="ndarray").T
-    graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(len(centres), len(centres)))
-    return connected_components(graph, directed=False)[1][voxel].astype(np.intp)
-
-
-def _join_hidden(label: IntArray, points: FloatArray, usable: NDArray[np.bool_]) -> None:
-    """Join the pieces in ``label (N,)`` whose pixels meet and that are near in a horizontal direction.
-
-    ``points (N, 3)`` are those of the ``usable (h, w)`` pixels.
-    """
-    grid = np.full(usable.shape, -1)
-    grid[usable] = np.arange(len(points))
-    joined: list[IntArray] = []
-    for step in range(1, GAP_PX + 1):
-        for a, b in (
-            (grid[:, step:], grid[:, :-step]),
-            (grid[step:], grid[:-step]),
-            (grid[step:, step:], grid[:-step, :-step]),
-            (grid[step:, :-step], grid[:-step, step:]),
-        ):
-            known = (a >= 0) & (b >= 0)
-            one, other = a[known], b[known]
-            apart = (label[one] != label[other]) & (label[one] >= 0) & (label[other] >= 0)
-            one, other = one[apart], other[apart]
-            near = np.linalg.norm((points[one] - points[other])[:, :2], axis=1) < HIDDEN_GAP_M
-            joined.append(np.stack([label[one[near]], label[other[near]]], axis=1))
-    a, b = np.concatenate(joined).T
-    count = label.max() + 1
-    graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
-    label[label >= 0] = connected_components(graph, directed=False)[1][label[label >= 0]]
-
-
-def _leave_out_arms(label: IntArray, heights: FloatArray, pixels: IntArray, least: int) -> str:
-    """Mark in ``label (N,)`` the pieces that reach in over the border; returns a note where one is kept.
-
-    A thing that the border cuts off looks like an arm. It is kept where there is nothing else, of ``least`` points or
-    more, and it comes down to the table.
-    """
-    first, last = pixels.min(axis=0), pixels.max(axis=0)
-    margin = np.maximum((last - first) * BORDER_SHARE, 1)
-    crossing = ((pixels < first + margin) | (pixels > last - margin)).any(axis=1) & (label >= 0)
-    over = [piece for piece in np.unique(label[crossing]) if heights[crossing & (label == piece)].min() > HOVERING_M]
-    others = np.bincount(label[(label >= 0) & ~np.isin(label, over)], minlength=1)
-    standing = [piece for piece in over if heights[label == piece].min() < HOVERING_M]
-    alone = bool(standing) and others.max() < least
-    label[np.isin(label, [piece for piece in over if not (alone and piece in standing)])] = BORDER
-    return CUT_OFF_NOTE if alone else ""
-
-
-def _join_behind(
-    label: IntArray, points: FloatArray, usable: NDArray[np.bool_], over: NDArray[np.bool_], colours: FloatArray
-) -> None:
-    """Join the pieces in ``label (N,)`` of one of ``colours (N, 3)`` that are apart only where something that is above
-    the table, at the pixels ``over (h, w)``, hides what is between them.
-
-    ``points (N, 3)`` are those of the ``usable (h, w)`` pixels.
-    """
-    grid = np.full(usable.shape, UNKNOWN)
-    grid[usable] = label
-    number = np.full(usable.shape, -1)
-    number[usable] = np.arange(len(points))
-    above = binary_dilation(over, iterations=GAP_PX) & (grid < 0)
-    if not above.any() or not (grid >= 0).any():
-        return
-    nearest = number[tuple(distance_transform_edt(grid < 0, return_distances=False, return_indices=True))]
-    mean = {piece: colours[label == piece].mean(axis=0) for piece in np.unique(label[label >= 0])}
-    pairs = []
-    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-        between = above[a] & above[b]
-        one, other = nearest[a][between], nearest[b][between]
-        near = (label[one] != label[other]) & (np.linalg.norm(points[one] - points[other], axis=1) < STRIP_M)
-        pairs.append(np.stack([label[one[near]], label[other[near]]], axis=1))
-    alike = [(a, b) for a, b in np.unique(np.concatenate(pairs), axis=0) if abs(mean[a] - mean[b]).max() < SAME_COLOUR]
-    if alike:
-        a, b = np.transpose(alike)
-        count = label.max() + 1
-        graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
-        label[label >= 0] = connected_components(graph, directed=False)[1][label[label >= 0]]
-
-
-def _leave_out_small(label: IntArray, heights: FloatArray, pixels: IntArray, least: int) -> str:
-    """Mark in ``label (N,)`` the pieces of fewer than ``least`` points; number the others from 0.
-
-    Returns a line that tells where things are that are too small, or nothing.
-    """
-    number, small = 0, []
-    for piece in np.unique(label[label >= 0]):
-        members = np.flatnonzero(label == piece)
-        if MIN_TOLD_SHARE * least <= len(members) < least and heights[members].min() > 0:
-            small.append("({:.0f}, {:.0f})".format(*pixels[members].mean(axis=0)))
-        label[members] = SMALL if len(members) < least else number
-        number += len(members) >= least
-    if not small:
-        return ""
-    return (
-        f"too small for keypoints: what is at pixel {', '.join(small[:MAX_TOLD])}; take larger or nearer images of it"
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class TableColour:
-    """Gaussian of the table's colours in [0, 1]: ``mean (3,)``; ``whitening (3, 3)`` maps to unit covariance."""
-
-    mean: Float32Array
-    whitening: Float32Array
-
-    @classmethod
-    def fit(cls, colours: Float32Array) -> TableColour:
-        """Fitted to ``colours (N, 3)``, outliers trimmed."""
-        colours = colours[:: max(1, len(colours) // COLOUR_SAMPLES)]
-        for _ in range(TRIM_ROUNDS):
-            covariance = np.cov(colours.T) + COLOUR_NOISE**2 * np.eye(3)
-            whitening = np.linalg.inv(np.linalg.cholesky(covariance)).T.astype(np.float32)
-            table = cls(np.median(colours, axis=0), whitening)
-            colours = colours[table._mahalanobis(colours) < TRIM_DEVIATIONS]
-        return table
-
-    def distance(self, colours: Float32Array) -> Float32Array:
-        """Mahalanobis distances ``(N,)`` of ``colours (N, 3)``, each first scaled up to the table's brightness.
-
-        A shadow has the table's colour, darker.
-        """
-        brightness = np.maximum(colours.mean(axis=1), COLOUR_NOISE)
-        return self._mahalanobis(colours * np.maximum(self.mean.mean() / brightness, 1)[:, None])
-
-    def _mahalanobis(self, colours: Float32Array) -> Float32Array:
-        return np.sqrt((((colours - self.mean) @ self.whitening) ** 2).sum(axis=1))

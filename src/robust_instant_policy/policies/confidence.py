@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.special import expit
 
 from robust_instant_policy.geometry import FloatArray, robust_std
 from robust_instant_policy.sanity import Finding
@@ -41,7 +42,7 @@ DISTORTED = 3.0  # `Evidence.distortion` above which a thing is another one than
 
 UNEXPLAINED_M = 0.06  # `Evidence.unexplained` above which it is not known what demonstrations have in common
 
-RECOGNISED = 0.8  # of the least confidence among demonstrations, from which on a scene counts as recognised
+RECOGNISED = 0.7  # of the least confidence in demonstrations, from which on a scene counts as recognised
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
 # Up to these values evidence says nothing: sound scenes have them.
 GOOD_DISTORTION = 2.0
@@ -120,7 +121,7 @@ class Evidence:
             / max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision))),
             "precision": self.precision / GOOD_PRECISION_M,
         }
-        ratios = {name: -float(np.log(max(ratio, 1.0))) for name, ratio in found.items() if np.isfinite(ratio)}
+        ratios = {name: -float(np.log(max(ratio, 1.0))) for name, ratio in found.items() if not np.isnan(ratio)}
         return {**dict.fromkeys(found, 0.0), **ratios, "doubts": -float(self.doubts), "warnings": -float(self.warnings)}
 
 
@@ -129,8 +130,8 @@ def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEF
     if evidence.errors:
         return 0.0
     score = coefficients["constant"] + sum(coefficients[name] * value for name, value in evidence.features().items())
-    vote = evidence.vote if np.isfinite(evidence.vote) else 1.0
-    probability = float(min(1.0, evidence.agreement / GOOD_AGREEMENT) * (1 + vote) / 2 / (1 + np.exp(-score)))
+    agreement, vote = np.nan_to_num(evidence.agreement), np.nan_to_num(evidence.vote, nan=1.0)
+    probability = float(min(1.0, agreement / GOOD_AGREEMENT) * (1 + vote) / 2 * expit(score))
     return UNKNOWN * probability if evidence.unknown_notes else probability
 
 
@@ -215,10 +216,12 @@ def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
 def recognition(demonstrated: FloatArray, keypoint_confidence: FloatArray) -> float:
     """How far a scene was recognised, in [0, 1], from the confidence ``(K,)`` of its keypoints.
 
-    It is compared with that of the demonstrations, ``demonstrated (I, K)``, of which the first is the reference that
-    the others are recognised by; with fewer than two there is nothing to compare, and it is 1. The lower quartile
-    counts: one keypoint may be hidden, but an object that is missing has several.
+    Each is compared with the least that it has in the demonstrations, ``demonstrated (I, K)``, of which the first is
+    the reference that the others are recognised by; with fewer than two there is nothing to compare, and it is 1. The
+    lower quartile counts: one keypoint may be hidden, but an object that is missing has several.
     """
-    usual = np.quantile(demonstrated[1:], 0.25, axis=1)
-    least = RECOGNISED * float(usual.min()) if len(usual) else 0.0
-    return min(1.0, float(np.quantile(keypoint_confidence, 0.25)) / least) if least > 0 else 1.0
+    if len(demonstrated) < 2:
+        return 1.0
+    least = RECOGNISED * demonstrated[1:].min(axis=0)
+    ratio = np.divide(keypoint_confidence, least, out=np.ones_like(keypoint_confidence), where=least > 0)
+    return min(1.0, float(np.quantile(ratio, 0.25)))

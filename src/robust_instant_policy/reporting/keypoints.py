@@ -10,7 +10,7 @@ import numpy as np
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import project
 from robust_instant_policy.perception import Accuracy, KeypointExtractor
-from robust_instant_policy.perception.view import REASONS, TABLE
+from robust_instant_policy.perception.pieces import REASONS, TABLE
 from robust_instant_policy.reporting.pages import render
 from robust_instant_policy.reporting.pictures import Mark, Picture, keypoint_colour, keypoint_marks, picture
 
