@@ -100,7 +100,7 @@ def loss_table(benchmark: Benchmark, summary: Summary, failures: Sequence[Failur
             moved = [known.get(row.key) for row in own if not _is_refused(row)]
             found = [failure for failure in moved if failure is not None]
             examined = examined or bool(found)
-            stages = [failure.stage for failure in found]
+            stages = ["keypoints" if failure.keypoint_error == 0 else failure.stage for failure in found]
             errors = [1e3 * failure.keypoint_error for failure in found if failure.keypoint_error]
             counts = [len(own) - len(moved), *(sum(map(stages.count, which)) for which in LOST.values())]
             cells = [str(count or NONE) for count in (*counts, len(own) - sum(counts))]
@@ -112,9 +112,9 @@ def loss_table(benchmark: Benchmark, summary: Summary, failures: Sequence[Failur
     note = (
         "Failed executions by the stage that lost them. *Refused*: no plan could be made, or the checks before motion "
         "refuse it. Of the others the first that holds: *replay fails*, the demonstrator's own trajectory for the "
-        "scene is no success either; *keypoints*, the method succeeds with the true ones; *plan*, it fails with the "
-        "true ones, too. The last column is the median, over failures that were examined beyond replays, of the "
-        "largest error of a keypoint on an object."
+        "scene is no success either; *keypoints*, the method succeeds with the true ones, or none lies on anything "
+        "that moves; *plan*, it fails with the true ones, too. The last column is the median, over failures that were "
+        "examined beyond replays, of the largest error of a keypoint on an object."
     )
     head = ("task", "method", "failed", "refused", *LOST, "not examined", "keypoint error, mm")
     return Table(head, tuple(rows), note)
