@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.geometry import FloatArray, GripperTriangle, invert_pose, make_pose
+from robust_instant_policy.geometry import FloatArray, GripperTriangle, invert_pose, make_pose, project
 from robust_instant_policy.trajectory import STATE_INDEX, Trajectory
 
 Where = Literal["demonstrations", "scene", "both"]
@@ -398,6 +398,62 @@ def half_hidden(o: Observation) -> Observation:
     return replace(o, rgb=rgb, depth=depth)
 
 
+def turned_camera(o: Observation, degrees: float) -> Observation:
+    turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    return replace(o, camera_pose=o.camera_pose @ make_pose(turn, (0, 0, 0)))
+
+
+def raised_pixels(o: Observation) -> tuple[FloatArray, FloatArray]:
+    """Rows and columns of the pixels that stand above the table."""
+    table = float(np.median(o.depth[o.depth > 0]))
+    return np.nonzero((o.depth > 0) & (o.depth < table - 0.015))
+
+
+def without_depth(o: Observation, pixels: FloatArray, radius_m: float = 0.025) -> Observation:
+    """No depth within ``radius_m`` of ``pixels (N, 2)``, as on glass or polished metal."""
+    depth = o.depth.copy()
+    reach = radius_m * o.intrinsics[0, 0] / np.median(depth[depth > 0])
+    rows, cols = np.indices(depth.shape)
+    for u, v in pixels:
+        depth[(cols - u) ** 2 + (rows - v) ** 2 < reach**2] = 0
+    return replace(o, depth=depth)
+
+
+def no_depth_at_grasps(d: Demonstration) -> Demonstration:
+    """No depth where grippers close, or else where the lowest fingertip is."""
+    closed = d.trajectory.gripper_state > 0.5
+    steps, arms = np.nonzero(closed[1:] & ~closed[:-1])
+    middles = d.trajectory.triplets[:, :, 1:].mean(axis=2)
+    if not len(steps):
+        steps, arms = np.array(np.unravel_index([middles[..., 2].argmin()], middles.shape[:2]))
+    pixels = project(middles[steps, arms], d.observation.intrinsics, d.observation.camera_pose)
+    return replace(d, observation=without_depth(d.observation, pixels))
+
+
+def no_depth_on_a_thing(o: Observation) -> Observation:
+    """No depth on what stands in the middle of what stands above the table."""
+    rows, cols = raised_pixels(o)
+    middle = np.argmin((rows - np.median(rows)) ** 2 + (cols - np.median(cols)) ** 2)
+    return without_depth(o, np.array([[cols[middle], rows[middle]]]))
+
+
+def twice(o: Observation) -> Observation:
+    """What stands above the table a second time, where the table is free; unchanged where there is no room."""
+    rows, cols = raised_pixels(o)
+    height, width = o.depth.shape
+    taken = np.zeros(o.depth.shape, dtype=bool)
+    taken[rows, cols] = True
+    shifts = [(down, right) for down in range(-height, height, 10) for right in range(-width, width, 10)]
+    for down, right in sorted(shifts, key=lambda shift: shift[0] ** 2 + shift[1] ** 2):
+        there = rows + down, cols + right
+        inside = (np.array(there) >= 0).all() and there[0].max() < height and there[1].max() < width
+        if inside and not taken[there].any():
+            rgb, depth = o.rgb.copy(), o.depth.copy()
+            rgb[there], depth[there] = o.rgb[rows, cols], o.depth[rows, cols]
+            return replace(o, rgb=rgb, depth=depth)
+    return o
+
+
 # Faults of a plan.
 
 
@@ -559,7 +615,13 @@ def _faults() -> dict[str, Fault]:
     for count in (1, 2, 3):
         add(f"first-{count}:demos", (), demonstrations=first(count))
     add("neighbouring-4:demos", ("outside",), demonstrations=neighbouring(4))
+    add("pitch-1deg:scene", ("said to be",), scene=lambda o, _: turned_camera(o, 1.0))
+    add("depth-8-bit:scene", ("8 bits",), scene=lambda o, _: replace(o, depth=np.rint(o.depth * 127) / np.float32(127)))
+    add("grey:scene", ("infrared",), scene=lambda o, _: replace(o, rgb=o.rgb[..., [1, 1, 1]]))
     add("half-hidden:scene", ("recognised",), scene=lambda o, _: half_hidden(o))
+    add("no-depth-at-grasps:demos", ("depth",), demonstrations=lambda ds: list(map(no_depth_at_grasps, ds)))
+    add("no-depth-on-a-thing:scene", ("depth",), scene=lambda o, _: no_depth_on_a_thing(o))
+    add("twice:scene", ("looks like",), scene=lambda o, _: twice(o))
     add("jump-0.8m:plan", ("step", "m from"), plan=plan_points(jump(0.8)))
     add("jump-0.3m:plan", ("step", "m from"), plan=plan_points(jump(0.3)))
     add("turn-179:plan", ("turn",), plan=plan_points(spin(179.0)))

@@ -9,8 +9,13 @@ from pathlib import Path
 
 import pytest
 from filelock import FileLock
+from hypothesis import settings
 
 from robust_instant_policy.cli import main
+from robust_instant_policy.datasets import load_demonstrations
+
+settings.register_profile("busy machine", deadline=None)
+settings.load_profile("busy machine")
 
 NUM_DEMONSTRATIONS = 5
 # These files take the most time. They come first, so that all workers end at about the same time.
@@ -46,6 +51,14 @@ def workbench(tmp_path_factory, worker_id) -> Path:
             _record(shared.with_suffix(".part"))
             shared.with_suffix(".part").rename(shared)
     return Path(shutil.copytree(shared, base / "workbench"))
+
+
+@pytest.fixture(scope="session")
+def context(workbench):
+    """The context of the workbench's demonstrations, made once in a worker for all tests that plan from it."""
+    from robust_instant_policy.policies import Settings, build_context
+
+    return build_context(load_demonstrations(workbench / "data" / "push-cube"), Settings(features="efficientnet"))
 
 
 @pytest.fixture(scope="session")

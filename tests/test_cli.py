@@ -19,6 +19,7 @@ from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.interrupts import noted_interrupts
 from robust_instant_policy.robots.signals import stop_on_signals
 from robust_instant_policy.tasks.record import record
+from tests.stand_in_server import StandInServer, error
 
 
 def refused(arguments: list[str], capsys) -> tuple[int, str]:
@@ -126,6 +127,29 @@ def test_a_model_file_that_is_missing_or_corrupt_is_told(workbench, tmp_path, ca
     )  # fmt: skip
     assert code == 1
     assert str(path) in line
+
+
+@pytest.mark.parametrize("server", ["absent", "refuses the key"])
+@pytest.mark.parametrize("command", ["plan", "serve", "demo", "eval"])
+def test_a_server_that_cannot_be_used_is_told_before_anything_else_is_done(
+    workbench, command, server, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    demos = ["--demos", str(workbench / "data" / "push-cube")]
+    arguments = {
+        "plan": [*demos, "--observation", str(workbench / "observation.npz")],
+        "serve": [*demos, "--port", "0"],
+        "eval": ["--methods", "rip", "neighbours", "--out", "run"],
+    }
+    busy = StandInServer(lambda _: error("no such key", 401))
+    address, words = ("http://127.0.0.1:9/v1", "is the server running") if server == "absent" else (busy.url, "key")
+    try:
+        status, line = refused([command, *arguments.get(command, []), "--llm", f"{address}#m"], capsys)
+    finally:
+        busy.close()
+    assert status == 1
+    assert words in line
+    assert not list(tmp_path.iterdir())  # nothing recorded, planned or evaluated
 
 
 def test_no_space_left_is_told_and_what_was_there_stays(workbench, tmp_path, capsys, monkeypatch):

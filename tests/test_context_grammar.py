@@ -79,6 +79,12 @@ def test_demonstrations_that_do_different_things_are_told_apart(family, number):
     assert "told apart by" in " ".join(prompt.notes())
 
 
+@pytest.mark.parametrize("number", [0, 1, 6])
+def test_along_each_axis_the_origin_is_that_of_one_thing_with_the_point_in_it(number):
+    keypoints, trajectories, draw = shown("row", number=number)
+    assert (errors(write_prompt(keypoints, trajectories), draw) < WITHIN_M).all()
+
+
 @pytest.mark.parametrize("number", [0, 3])
 def test_one_demonstration_that_contradicts_the_others_is_no_way_of_its_own(number):
     keypoints, trajectories, draw = shown("place", 6, number=number)

@@ -63,7 +63,7 @@ def test_a_demonstration_comes_back_as_it_was(folder):
         assert np.abs(back.observation.depth - original.observation.depth)[seen].max() < 0.6e-4
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     depth=hnp.arrays(
         np.float32,

@@ -15,7 +15,7 @@ from robust_instant_policy.errors import DatasetError, ModelError, UsageError
 from robust_instant_policy.evaluation import Episode, Scene, Setup, Variant, scene_seed
 from robust_instant_policy.evaluation.work import SceneWork
 from robust_instant_policy.evaluation.workbench import Workbench
-from robust_instant_policy.policies import Settings, build_context, make_policy
+from robust_instant_policy.policies import Settings, make_policy
 from robust_instant_policy.policies.diffusion import ImageDiffusion, KeypointDiffusion, dp, kat_dp, training, vision
 from robust_instant_policy.policies.diffusion.denoiser import Denoiser
 from robust_instant_policy.policies.diffusion.scaling import Scaling
@@ -41,12 +41,6 @@ THREE = Settings(features="efficientnet", num_queries=3)
 @pytest.fixture(scope="module")
 def demonstrations(workbench):
     return load_demonstrations(workbench / "data" / "push-cube")
-
-
-@pytest.fixture(scope="module")
-def context(demonstrations):
-    """What keypoint policies know of the demonstrations, made once."""
-    return build_context(demonstrations, THREE)
 
 
 @pytest.fixture

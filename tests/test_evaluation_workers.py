@@ -152,11 +152,11 @@ def test_plans_that_a_figure_needs_are_made_until_they_are_stored(interrupted, r
     shutil.copytree(interrupted[0], folder)
     suites = make_suites(["trajectories"], Choice(NEIGHBOURS, [TASK], ["neighbours"], 2))
     works: list[SceneWork] = []
+    shown = load_demonstrations(reach / DATA)
+    plan = Neighbours().fit(shown[:SHOWN]).plan(shown[SHOWN].observation)
 
     def plan_one(setup, missing):
         works.extend(missing)
-        shown = load_demonstrations(reach / DATA)
-        plan = Neighbours().fit(shown[:SHOWN]).plan(shown[SHOWN].observation)
         yield Planned(missing[0].scene, missing[0].plans[0], plan)
 
     for left in (2, 1):
@@ -186,9 +186,9 @@ def test_two_workers_of_which_one_is_killed_write_the_rows_that_one_writes(recor
             os.kill(killed[0], signal.SIGKILL)
 
     setup = setup_in(tmp_path, reach / "data")
-    run_suites(suites_of(len(recorded)), setup, tmp_path, LocalWorkers(2), Progress(outcome=kill_one))
+    run_suites(suites_of(3), setup, tmp_path, LocalWorkers(2), Progress(outcome=kill_one))
     assert killed
-    assert timeless(read_results(tmp_path).episodes) == timeless(recorded)
+    assert timeless(read_results(tmp_path).episodes) == timeless(recorded[:3])
     assert not multiprocessing.active_children()
 
 

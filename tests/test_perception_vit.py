@@ -1,5 +1,6 @@
 """Vision-transformer descriptors against transformers' own models and against slow, plain formulas."""
 
+import hashlib
 import json
 import math
 import shutil
@@ -288,7 +289,7 @@ def test_weights_come_from_the_hub_and_then_from_its_cache(vit_folder, monkeypat
             else:
                 body = files[name]
             self.send_response(200)
-            self.send_header("ETag", f'"{name}"')
+            self.send_header("ETag", f'"{hashlib.sha256(body).hexdigest()}"')
             self.send_header("X-Repo-Commit", commit)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
@@ -315,6 +316,14 @@ def test_weights_come_from_the_hub_and_then_from_its_cache(vit_folder, monkeypat
     assert all(
         torch.equal(fetched[name], tensor) and torch.equal(cached[name], tensor) for name, tensor in expected.items()
     )
+    weights = next(tmp_path.rglob("model.safetensors"))
+    weights.resolve().chmod(0o666)
+    with pytest.raises(ModelError, match=r"other users can write to .*; run chmod -R go-w"):
+        load_checkpoint("some/vit")
+    weights.resolve().chmod(0o600)
+    weights.resolve().write_bytes(weights.read_bytes()[:-1] + b"\0")
+    with pytest.raises(ModelError, match=r"model\.safetensors has another SHA-256 than the hub gave for it; remove"):
+        load_checkpoint("some/vit")
 
 
 def test_without_a_connection_the_hub_is_given_up_within_seconds(monkeypatch, tmp_path):

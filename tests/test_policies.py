@@ -13,7 +13,6 @@ from robust_instant_policy.policies import (
     KeypointActionTokens,
     RobustInstantPolicy,
     Settings,
-    build_context,
     locate,
 )
 from robust_instant_policy.policies.confidence import (
@@ -58,11 +57,6 @@ def demonstrations(workbench):
 
 
 @pytest.fixture(scope="module")
-def context(demonstrations):
-    return build_context(demonstrations, SETTINGS)
-
-
-@pytest.fixture(scope="module")
 def observation(workbench):
     return rip.Observation.load(workbench / "observation.npz")
 
@@ -95,11 +89,11 @@ def test_objects_that_demonstrations_recognise_with_little_confidence_may_be_so_
     assert recognition(sure[:1], np.full(10, 0.35)) == 1  # nothing to compare with
 
 
-def test_rip_and_rip_adaptive_succeed_with_the_embedded_model(demonstrations, observation):
+def test_rip_and_rip_adaptive_succeed_with_the_embedded_model(demonstrations, context, observation):
     llm = rip.connect("embedded")
     try:
         plan = rip.RobustInstantPolicy(llm=llm, num_queries=5, dof=1.5).fit(demonstrations).plan(observation)
-        adaptive = RobustInstantPolicy(llm, num_queries=10, adaptive=True).fit(demonstrations).plan(observation)
+        adaptive = RobustInstantPolicy(llm, num_queries=10, adaptive=True).fit_context(context).plan(observation)
     finally:
         llm.close()
     assert len(plan.candidates) == 5
@@ -233,7 +227,7 @@ def test_a_tie_or_an_error_of_a_check_leaves_no_confidence():
 
 
 @pytest.mark.parametrize(
-    "unknown", [{"prediction": np.nan}, {"novelty": np.nan}, {"undecided": 1}, {"distortion": 3.5}]
+    "unknown", [{"prediction": np.nan}, {"novelty": np.nan}, {"undecided": 1}, {"distortion": 3.5}, {"doubled": 1}]
 )
 def test_what_cannot_be_known_bounds_the_confidence(unknown):
     assert 0.4 < plan_confidence(replace(SURE, **unknown)) < UNKNOWN

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.policies.gp import GaussianProcess, KeypointRegression
 
@@ -26,10 +25,9 @@ def test_a_curved_law_is_found_too():
     assert np.abs(process.predict(new)[0] - np.sin(10 * new)).max() < 0.1
 
 
-def test_in_scenes_that_were_shown_it_says_about_what_was_shown(workbench):
-    shown = load_demonstrations(workbench / "data" / "push-cube")
-    policy = KeypointRegression(features="efficientnet").fit(shown)
-    for demonstration in shown:
+def test_in_scenes_that_were_shown_it_says_about_what_was_shown(context, workbench):
+    policy = KeypointRegression(features="efficientnet").fit_context(context)
+    for demonstration in context.demonstrations:
         plan = policy.plan(demonstration.observation)
         assert np.abs(plan.trajectory.actions[-1] - demonstration.trajectory.actions[-1]).max() < 0.06
     plan = policy.plan(Observation.load(workbench / "observation.npz"))

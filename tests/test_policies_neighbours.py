@@ -14,8 +14,8 @@ def demonstrations(workbench):
 
 
 @pytest.fixture(scope="module")
-def policy(demonstrations) -> Neighbours:
-    return Neighbours(features="efficientnet", num_queries=4).fit(demonstrations)
+def policy(context) -> Neighbours:
+    return Neighbours(features="efficientnet", num_queries=4).fit_context(context)
 
 
 def test_in_a_scene_that_was_shown_the_nearest_neighbour_is_what_was_shown(policy, demonstrations):

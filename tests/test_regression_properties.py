@@ -19,7 +19,7 @@ from robust_instant_policy.regression.likelihood import evaluate, log_likelihood
 from robust_instant_policy.regression.student_t import solve
 from tests.regression_scenes import KINDS, draw_scene
 
-SETTINGS = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+SETTINGS = settings(max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 
 
 @st.composite
@@ -71,7 +71,7 @@ def test_scaling_and_shifting_the_input_move_the_output_alike(given_candidates, 
         assert np.allclose(other.scale(AT) / factor, one.scale(AT), rtol=1e-2, atol=tolerance)
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=10, derandomize=True)
 @given(st.integers(0, 1000), st.sampled_from(list(KINDS)), st.sampled_from(["em", "mixture"]))
 def test_rigid_motions_of_the_input_move_the_output_alike(seed, kind, estimator):
     scene = draw_scene(seed, "piecewise", 5, 1, kind)
@@ -123,7 +123,7 @@ def test_a_candidate_moved_to_infinity_changes_nothing(given_candidates, which, 
         assert np.abs(far.mean(AT) - StudentTRegression(unit=unit).fit(rest).mean(AT)).max() < 0.01
 
 
-@settings(max_examples=200, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=200, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(
     candidates(),
     st.sampled_from([0.5, 1.5, 5.0, 40.0, np.inf]),

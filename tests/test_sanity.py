@@ -147,6 +147,8 @@ def test_quaternions_read_in_the_wrong_order_are_named(demonstrations):
         ("bgr:scene", "red and blue are exchanged"),
         ("depth-other-lens:scene", "another lens"),
         ("cropped-3%:scene", "one was cropped"),
+        ("fx-half:scene", r"displaces what it shows by \d+ mm: intrinsics"),
+        ("pitch-1deg:scene", r"displaces what it shows by 2\d mm: the camera pose is wrong"),
     ],
 )
 def test_a_scene_that_contradicts_the_demonstrations_is_refused_and_the_mistake_is_named(
@@ -184,6 +186,25 @@ def test_another_camera_is_no_error_where_its_calibration_is_right(report, scene
 def test_demonstrations_that_do_not_belong_together_are_refused(demonstrations, fault, words):
     with pytest.raises((DemonstrationError, GeometryError), match=words):
         check_demonstrations(FAULTS[fault].demonstrations(demonstrations)).raise_if_wrong()
+
+
+def test_depth_that_is_missing_where_the_gripper_works_or_a_thing_may_be_is_told(report, demonstrations, scene):
+    blind = FAULTS["no-depth-at-grasps:demos"].demonstrations
+    count = len(demonstrations)
+    for some, severity in ((demonstrations, "warning"), (demonstrations[:1], "unchecked")):
+        shown = [*blind(some), *demonstrations[len(some) :]]
+        (hole,) = [finding for finding in check_demonstrations(shown).findings if finding.kind == "hole"]
+        assert hole.severity == severity
+        assert f"in {len(some)} of {count} demonstrations" in hole.message
+    found = report.check_observation(FAULTS["no-depth-on-a-thing:scene"].scene(scene, demonstrations))
+    (hole,) = [finding for finding in found if finding.kind == "hole"]
+    assert hole.severity == "warning"
+    assert re.search(r"a hole, \d+ mm wide, at pixel \(\d+, \d+\)", hole.message)
+
+
+@pytest.mark.parametrize(("fault", "words"), [("depth-8-bit:scene", "8 bits"), ("grey:scene", "infrared")])
+def test_images_that_lost_what_the_camera_saw_are_told(report, scene, fault, words):
+    assert any(words in str(finding) for finding in report.check_observation(FAULTS[fault].scene(scene, ())))
 
 
 def test_states_inverted_while_pushing_are_doubted(demonstrations):

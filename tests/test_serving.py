@@ -16,7 +16,6 @@ from websockets.sync.client import connect
 
 from robust_instant_policy.checks import is_trusted
 from robust_instant_policy.cli import main
-from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.datasets.images import encode_depth, encode_png
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import UsageError
@@ -70,11 +69,6 @@ class Running:
         self.server.should_exit = True
         self.thread.join(20)
         assert not self.thread.is_alive()
-
-
-@pytest.fixture(scope="module")
-def context(workbench):
-    return Neighbours().fit(load_demonstrations(workbench / "data" / "push-cube")).context_
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from robust_instant_policy.errors import UnreachableError
-from robust_instant_policy.geometry import invert_pose, lift
+from robust_instant_policy.geometry import invert_pose, lift, transform_points
 from robust_instant_policy.motion.arm import Motion
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.trajectory import Trajectory, downsample
@@ -134,10 +134,11 @@ def test_doing_nothing_fails_in_words(task, attempt):
 def test_depth_and_calibration_put_the_banana_where_it_is(banana):
     observation = banana.reset(11)
     truth = banana.scene_truth()
-    rows, columns = np.nonzero(truth.parts == truth.names.index("banana"))
+    part = truth.names.index("banana")
+    rows, columns = np.nonzero(truth.parts == part)
     pixels = np.stack([columns, rows], axis=1)
     points = lift(pixels, observation.depth[rows, columns], observation.intrinsics, observation.camera_pose)
-    local = truth.material_point(points, "banana")
+    local = transform_points(invert_pose(truth.poses[part]), points)
     assert np.abs(local[:, 2]).max() < 0.025  # of its own thickness
     assert np.percentile(local[:, 2], 95) > 0.010
     table = lift([[320, 10]], observation.depth[10, 320][None], observation.intrinsics, observation.camera_pose)

@@ -42,13 +42,13 @@ def forward_by_dh(joints):
 
 
 @given(angles)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_forward_kinematics_are_those_of_the_published_parameters(joints):
     np.testing.assert_allclose(kinematics.tool_pose(joints), forward_by_dh(joints), atol=1e-9)
 
 
 @given(st.lists(st.floats(-0.35, 0.35), min_size=6, max_size=6))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_the_arm_follows_poses_that_joints_can_reach(change):
     start = np.array([0.0, -1.6, 2.0, -1.97, -1.57, 0.0])
     path = np.linspace(start, start + change, 20)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from numbers import Integral, Real
 
 import numpy as np
@@ -14,7 +15,7 @@ from robust_instant_policy.geometry import as_numbers
 
 def checked_positive(name: str, value: object, infinite: bool = False) -> float:
     """``value`` as a float > 0; ``infinite`` allows infinity. Text, booleans and NaN raise `InvalidValueError`."""
-    if _is_number(value, Real) and value > 0 and (infinite or math.isfinite(value)):  # type: ignore[operator, arg-type]
+    if _is_number(value, Real) and value > 0 and (is_finite(value) or (infinite and value == math.inf)):  # type: ignore[operator]
         return float(value)  # type: ignore[arg-type]
     raise InvalidValueError(
         f"{name} must be a positive {'number or inf' if infinite else 'finite number'}, {_got(value)}"
@@ -56,6 +57,11 @@ def checked_pose(name: str, values: ArrayLike) -> NDArray[np.float64]:
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         raise InvalidValueError(f"the last row of {name} (4, 4) must be 0 0 0 1; is it transposed?")
     return pose
+
+
+def is_finite(value: object) -> bool:
+    """Whether ``value`` is a number that a float can hold; `math.isfinite` raises for larger integers."""
+    return _is_number(value, Real) and abs(value) <= sys.float_info.max  # type: ignore[arg-type]
 
 
 def _is_number(value: object, kind: type) -> bool:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import grp
+import hashlib
 import json
 import os
+import pwd
 import secrets
 import shutil
 import stat
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -65,14 +69,54 @@ def read_json(path: str | Path, kind: str = "a JSON object") -> dict[str, Any]:
             text = file.read(MAX_JSON_BYTES + 1)
         if len(text) > MAX_JSON_BYTES:
             raise DatasetError(f"{path} is larger than {MAX_JSON_BYTES >> 20} MiB, too large for such a file")
-        content = json.loads(text.decode())
+        content = parse_json(text)
     except FileNotFoundError:
         raise DatasetError(f"{path} is missing; restore it, or write it again") from None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise DatasetError(f"{path} is not {kind}: it cannot be read as JSON; restore it, or write it again") from error
     if not isinstance(content, dict):
         raise DatasetError(f"{path} is not {kind}: it must hold a JSON object; restore it, or write it again")
     return content
+
+
+def parse_json(text: str | bytes) -> Any:
+    """What ``text`` from outside holds. Raises `ValueError`, also for deep nesting and for integers beyond a float."""
+    try:
+        return json.loads(text, parse_int=_whole)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > sys.float_info.max_10_exp:
+        raise ValueError(f"an integer of {len(digits)} digits")
+    return int(digits)
+
+
+def sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def others_can_write(path: Path, in_own_group: bool = True) -> bool:
+    """Whether another user could exchange a file, or one in a folder, between its check and its use.
+
+    Many systems make files writable for a group of which their owner is the only member; without ``in_own_group`` that
+    counts as nobody.
+    """
+    status = path.stat()
+    if status.st_uid not in (0, os.geteuid()) or status.st_mode & stat.S_IWOTH:
+        return True
+    return bool(status.st_mode & stat.S_IWGRP) and (in_own_group or not _is_own_group(status.st_gid))
+
+
+def _is_own_group(number: int) -> bool:
+    """Whether a group is that of this user alone."""
+    try:
+        group, user = grp.getgrgid(number), pwd.getpwuid(os.geteuid())
+    except KeyError:
+        return False
+    return group.gr_name == user.pw_name and not set(group.gr_mem) - {user.pw_name}
 
 
 def _checked_name(path: str | Path) -> str | Path:

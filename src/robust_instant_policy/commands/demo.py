@@ -15,7 +15,7 @@ from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import UnreachableError, UsageError
 from robust_instant_policy.evaluation import Variant, holds_results, obtain_demonstrations, scene_seed
 from robust_instant_policy.files import file_stem
-from robust_instant_policy.llm import DEADLINE_S, connect
+from robust_instant_policy.llm import DEADLINE_S, check_server, connect
 from robust_instant_policy.policies import RobustInstantPolicy, Settings
 from robust_instant_policy.reporting.run import (
     PLAN_FILE,
@@ -75,6 +75,7 @@ def run_demo(
     screen = StageConsole()
     scene = scene_seed(seed, 0)
     screen.say(f"{task_name}: demonstrations, then a plan and its execution in a new scene (seed {scene})")
+    check_server(llm_spec)
     with screen.stage("simulator"):
         task = make_task(task_name)
     try:

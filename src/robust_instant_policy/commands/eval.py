@@ -36,7 +36,8 @@ from robust_instant_policy.evaluation.processes import LocalWorkers
 from robust_instant_policy.evaluation.scenes import SPLITS, first_demonstration_seed
 from robust_instant_policy.evaluation.store import EPISODES_FILE
 from robust_instant_policy.evaluation.work import Outcome, Workers
-from robust_instant_policy.llm import model_name
+from robust_instant_policy.llm import check_server, model_name
+from robust_instant_policy.policies import ASKING_METHODS
 from robust_instant_policy.policies.training import DEFAULT_STEPS
 from robust_instant_policy.reporting.publication import PAGE_FILE, publish
 from robust_instant_policy.reporting.training import keep_training_picture
@@ -162,6 +163,9 @@ def run(options: argparse.Namespace) -> int:
         LocalWorkers(options.workers or 1) if options.ray is None else RayWorkers(options.ray, options.workers)
     )
     suites = make_suites(options.suite or ["chosen"], choice)
+    asks = any(variant.method in ASKING_METHODS for suite in suites for variant in suite.variants)
+    if asks and not options.replay and not (options.out / STORE_FILE).exists():  # which may hold all the answers
+        check_server(options.llm)
     arguments = ["rip", *options.arguments]
     evaluate(suites, setups, options.out, workers, arguments, options.keep, options.workers or 1)
     return 0

@@ -10,7 +10,7 @@ from robust_instant_policy.commands.console import StageConsole
 from robust_instant_policy.commands.options import method_settings
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.llm import connect
+from robust_instant_policy.llm import check_server, connect
 from robust_instant_policy.policies import RobustInstantPolicy
 
 
@@ -26,6 +26,7 @@ def fitted_policy(
     ``workspace (2, 3)``, metres, are the corners of what may be a keypoint. The language model is closed at the end.
     """
     with screen.stage(f"language model ({options.llm})"):
+        check_server(options.llm)
         model = connect(options.llm)
     with closing(model):
         policy = RobustInstantPolicy(

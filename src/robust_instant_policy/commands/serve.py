@@ -9,7 +9,7 @@ from robust_instant_policy.commands.console import StageConsole
 from robust_instant_policy.commands.options import add_method, method_settings, natural, positive
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.errors import MissingExtraError
-from robust_instant_policy.llm import connect
+from robust_instant_policy.llm import check_server, connect
 from robust_instant_policy.network import listen
 from robust_instant_policy.policies import KeypointPolicy, Neighbours, RobustInstantPolicy
 from robust_instant_policy.serving.address import KEY_VARIABLE, checked_key
@@ -64,6 +64,7 @@ def run(options: argparse.Namespace) -> int:
     policy: KeypointPolicy = Neighbours(settings, num_queries=options.queries)
     if options.method == "rip":
         with screen.stage(f"language model ({options.llm})"):
+            check_server(options.llm)
             model = connect(options.llm)
         policy = RobustInstantPolicy(model, settings, num_queries=options.queries, deadline_s=options.deadline)
     try:

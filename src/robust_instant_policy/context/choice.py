@@ -7,10 +7,10 @@ centre is
 
 with o, o' the things' positions, B, B' their axes, and s the sizes of things that have one: share of the way, points
 fixed in the things, offset in the axes and its growth are all linear. Where the way counts along each axis, o' - o is
-its three parts along R. Ridge regression gives w, and its hat matrix H
-the residuals of each demonstration when it is left out, (I - H_ii)⁻¹ r_i, for all candidates and steps at once (the
-keypoints of the one that is left out are noisy, too). The hand's turn is predicted by the mean of the others' in the
-axes.
+its three parts along R, and points in the things count along each axis by the share of the way that a first fit found.
+Ridge regression gives w, and its hat matrix H the residuals of each demonstration when it is left out,
+(I - H_ii)⁻¹ r_i, for all candidates and steps at once (the keypoints of the one that is left out are noisy, too). The
+hand's turn is predicted by the mean of the others' in the axes.
 """
 
 from __future__ import annotations
@@ -48,16 +48,24 @@ UNEXPLAINED_M = 0.015  # error of a key step from which on more origins are trie
 SHARES, POINTS, OFFSET, GROWTH = slice(0, 6), slice(6, 15), slice(15, 18), slice(18, None)
 
 ZERO = np.zeros(3)
+IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class Origin:
     """On which things an origin depends: the ``ends``, one to three, and those with whose size it moves. ``by_axis`` it
-    is at a share of the way of its own along each axis."""
+    is at a share of the way of its own along each axis; along each the points in both ends count by the ``shares (3,)``
+    of that way, where these are known."""
 
     ends: tuple[Thing, ...]
     growing: tuple[Thing, ...] = ()
     by_axis: bool = False
+    shares: FloatArray | None = None
+
+    @property
+    def weights(self) -> tuple[FloatArray, ...]:
+        """``(3,)``, of the point in each of the ends along each axis."""
+        return tuple(np.ones((len(self.ends), 3)) if self.shares is None else np.array([1 - self.shares, self.shares]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +141,12 @@ class Candidates:
             if not origin.growing:
                 own[..., GROWTH] = 0.0
             first = self._position(origin.ends[0], home)
-            for number, end in enumerate(origin.ends):
+            for number, (end, weight) in enumerate(zip(origin.ends, origin.weights, strict=True)):
                 if end.turns:
-                    own[..., POINTS.start + 3 * number :][..., :3] = scene[end].rotation
+                    turned = scene[end].rotation
+                    if origin.shares is not None:
+                        turned = (rotation * weight) @ np.swapaxes(rotation, -1, -2) @ turned
+                    own[..., POINTS.start + 3 * number :][..., :3] = turned
                 if number:
                     away = (self._position(end, home) - first)[..., None]
                     parts = (
@@ -267,9 +278,10 @@ def choose_frames(
         if errors.mean_squared[list(key_steps)].min(axis=(1, 2)).max() > UNEXPLAINED_M**2:
             candidates = candidates.with_more_origins(things)
             errors = prediction_errors(candidates, hands, second)
+            candidates = _with_weighted_points(candidates, errors, hands, second)
+            errors = prediction_errors(candidates, hands, second)
     chosen = _viterbi(errors.cost.reshape(len(weight), -1) * weight[:, None])
-    picks = [np.unravel_index(index, errors.cost.shape[1:]) for index in chosen]
-    return _fitted(candidates, errors, hands, second, [(int(m), int(n)) for m, n in picks])
+    return _fitted(candidates, errors, hands, second, np.transpose(np.unravel_index(chosen, errors.cost.shape[1:])))
 
 
 def _viterbi(cost: FloatArray) -> list[int]:
@@ -286,12 +298,34 @@ def _viterbi(cost: FloatArray) -> list[int]:
     return chosen[::-1]
 
 
+def _best(errors: Errors) -> IntArray:
+    """Numbers ``(T, 2)`` of the axes and the origin that suit each step best."""
+    cost = errors.cost
+    return np.stack(np.unravel_index(cost.reshape(len(cost), -1).argmin(axis=1), cost.shape[1:]), axis=1)
+
+
+def _with_weighted_points(
+    candidates: Candidates, errors: Errors, hands: FloatArray, second: NDArray[np.bool_] | None
+) -> Candidates:
+    """``candidates`` with the shares of those origins by axis that suit some step best, as fitted to the best of them:
+    shares times points in the ends are not linear in both.
+    """
+    picks = _best(errors)
+    frames = _fitted(candidates, errors, hands, second, picks)
+    best = errors.cost.min(axis=(1, 2))
+    origins = list(candidates.origins)
+    for number in np.unique(picks[:, 1]):
+        if origins[number].by_axis:
+            step = min(np.flatnonzero(picks[:, 1] == number), key=lambda step: best[step])
+            origins[number] = replace(origins[number], shares=frames[step].shares[0].clip(0, 1))
+    return replace(candidates, origins=tuple(origins))
+
+
 def _with_fitted_lines(
     candidates: Candidates, errors: Errors, hands: FloatArray, second: NDArray[np.bool_] | None
 ) -> Candidates:
     """``candidates`` with those lines fitted that suit some step best."""
-    best = errors.cost.reshape(hands.shape[1], -1).argmin(axis=1)
-    picks = np.stack(np.unravel_index(best, errors.cost.shape[1:]), axis=1)
+    picks = _best(errors)
     axes = list(candidates.axes)
     for index in np.unique(picks[:, 0]):
         if len(axes[index].ends) == 2:
@@ -345,9 +379,9 @@ def _fitted(
     errors: Errors,
     hands: FloatArray,
     second: NDArray[np.bool_] | None,
-    picks: Sequence[tuple[int, int]],
+    picks: IntArray,
 ) -> list[Frame]:
-    """The frames of ``picks`` (axes, origin), one a step, with their numbers fitted robustly to the demonstrations."""
+    """The frames of ``picks (T, 2)`` (axes, origin), with their numbers fitted robustly to the demonstrations."""
     centre = hands.mean(axis=2)
     home = centre[:, 0].mean(axis=0)
     start, (design, penalty) = candidates.start(home), candidates.design(home, second)
@@ -370,6 +404,7 @@ def _fitted(
                 origin.ends,
                 tuple(w[POINTS].reshape(3, 3)[: len(origin.ends)]),
                 tuple(shares if origin.by_axis else np.repeat(shares[:, :1], 3, axis=1)),
+                origin.weights,
                 tuple(zip(origin.growing, w[GROWTH].reshape(-1, 3), strict=False)),
                 home,
                 float(np.sqrt(np.median(errors.squared[step, m, n]))),

@@ -72,8 +72,9 @@ class Frame:
     """A coordinate system that can be found in any scene.
 
     Its origin is the first of ``ends``, moved by ``shares (3,)`` of the way to each further end along the frame's axes,
-    and by ``shifts (3,)``, metres, in the axes of each end; the world, as an end, is at ``home (3,)``. ``growth`` are
-    things with the offset ``(3,)``, metres in the frame, by which the origin moves when the thing's size doubles.
+    and by ``shifts (3,)``, metres, in the axes of each end, which count by ``weights (3,)`` (default: ones) along the
+    frame's axes; the world, as an end, is at ``home (3,)``. ``growth`` are things with the offset ``(3,)``, metres in
+    the frame, by which the origin moves when the thing's size doubles.
     ``error``, metres, is how far off the demonstrations are when each is predicted from the others (`choose_frames`).
     """
 
@@ -81,6 +82,7 @@ class Frame:
     ends: tuple[Thing, ...]
     shifts: tuple[FloatArray, ...]
     shares: tuple[FloatArray, ...] = ()
+    weights: tuple[FloatArray, ...] = ()
     growth: tuple[tuple[Thing, FloatArray], ...] = ()
     home: FloatArray = field(default_factory=lambda: np.zeros(3))
     error: float = float("nan")
@@ -114,8 +116,10 @@ class Frame:
         for point, share in zip(points[1:], self.shares, strict=True):
             along = (point - points[0])[:, None] @ rotation * share
             origin = origin + (along @ np.swapaxes(rotation, 1, 2))[:, 0]
-        for end, shift in zip(self.ends, self.shifts, strict=True):
-            origin = origin + scene[end].rotation @ shift
+        weights = self.weights or [np.ones(3)] * len(self.ends)
+        for end, shift, weight in zip(self.ends, self.shifts, weights, strict=True):
+            along = (scene[end].rotation @ shift)[:, None] @ rotation * weight
+            origin = origin + (along @ np.swapaxes(rotation, 1, 2))[:, 0]
         for thing, offset in self.growth:
             origin = origin + (scene[thing].size - 1)[:, None] * (rotation @ offset)
         pose = np.tile(np.eye(4), (len(origin), 1, 1))

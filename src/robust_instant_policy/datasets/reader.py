@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -15,7 +14,7 @@ from robust_instant_policy.datasets.folder import Folder, inside, open_folder, r
 from robust_instant_policy.datasets.images import read_depth, read_rgb
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
-from robust_instant_policy.files import excerpt
+from robust_instant_policy.files import excerpt, parse_json
 from robust_instant_policy.geometry import FloatArray, as_numbers
 from robust_instant_policy.trajectory import Trajectory
 
@@ -116,8 +115,8 @@ def square(values: object, side: int) -> FloatArray:
 def _info(text: object) -> dict[str, str | float | int]:
     """Further facts on an episode, written as JSON."""
     try:
-        facts = json.loads(text) if isinstance(text, str) else None
-    except (ValueError, RecursionError):
+        facts = parse_json(text) if isinstance(text, str) else None
+    except ValueError:
         facts = None
     if not isinstance(facts, dict) or not all(isinstance(fact, str | float | int) for fact in facts.values()):
         raise ValueError(f"{layout.INFO_COLUMN} must be a JSON object of strings and numbers")

@@ -140,5 +140,9 @@ def decode_video(
                     raise DatasetError(f"{path} holds images of several sizes: restore it, or record the folder again")
                 if frame.time >= start_s - half_frame:
                     yield frame.to_ndarray(format=pixel_format)
-    except (OSError, ValueError, IndexError, TypeError, ArithmeticError, MemoryError, av.FFmpegError) as error:
+    # Of what a damaged file lacks, PyAV gives None, or an attribute that is not there.
+    except (
+        OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError, MemoryError,
+        RuntimeError, av.FFmpegError,
+    ) as error:  # fmt: skip
         raise DatasetError(f"{path} cannot be read as a video: restore it, or record the folder again") from error

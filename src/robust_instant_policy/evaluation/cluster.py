@@ -41,8 +41,9 @@ class RayWorkers:
             import ray
         except ModuleNotFoundError as error:
             raise MissingExtraError("ray", "distributed") from error
+        own = {"include_dashboard": False} if self.address == "local" else {}
         try:
-            ray.init(address=self.address, log_to_driver=False, logging_level="warning")
+            ray.init(address=self.address, log_to_driver=False, logging_level="warning", **own)
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise UsageError(
                 f"no Ray cluster at {self.address!r} ({error}); start one with: ray start --head"

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.suites import Suite
-from robust_instant_policy.files import read_regular, write_whole
+from robust_instant_policy.files import parse_json, read_regular, write_whole
 
 MANIFEST_FILE = "run.json"
 GIB = 2**30
@@ -49,7 +49,7 @@ class Manifest:
         if not path.exists():
             return cls()
         try:
-            content = json.loads(read_regular(path))
+            content = parse_json(read_regular(path))
             return cls(
                 tuple(Suite.from_json(one) for one in content["suites"]),
                 tuple(Invocation(**one) for one in content["invocations"]),

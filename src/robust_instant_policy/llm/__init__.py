@@ -1,6 +1,6 @@
 """Language models: servers that speak OpenAI's protocol, llama.cpp model files, and the embedded model."""
 
-from robust_instant_policy.llm.connect import connect, model_name
+from robust_instant_policy.llm.connect import check_server, connect, model_name
 from robust_instant_policy.llm.model import DEADLINE_S, LanguageModel, Listener, Sampling, refusal_advice
 from robust_instant_policy.llm.store import RecordedModel, ReplayedModel, SampleStore
 
@@ -12,6 +12,7 @@ __all__ = [
     "ReplayedModel",
     "SampleStore",
     "Sampling",
+    "check_server",
     "connect",
     "model_name",
     "refusal_advice",

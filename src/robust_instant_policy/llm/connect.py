@@ -37,6 +37,19 @@ def model_name(spec: str) -> str:
     return _parse(spec)[0]
 
 
+def check_server(spec: str) -> None:
+    """One short request where ``spec`` names a server, so that a wrong address, key or model is told before long work.
+
+    Raises `UsageError` as `connect` does, `ModelError` where the server cannot be used.
+    """
+    if spec == "embedded" or spec.startswith("gguf:"):
+        return
+    from robust_instant_policy.llm.endpoint import Endpoint
+
+    if isinstance(model := connect(spec), Endpoint):
+        model.check()
+
+
 def _parse(spec: str) -> tuple[str, Callable[[], LanguageModel]]:
     """The model's name, and what makes it. Imports wait until then: they take most of the time."""
     kind, _, rest = spec.partition(":")

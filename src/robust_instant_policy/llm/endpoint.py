@@ -37,6 +37,8 @@ MAX_CONCURRENT = 32  # requests under way at a time
 # token for " 12" need half of the estimate, all others more.
 TRUNCATED_SHARE = 0.45
 MIN_TOKENS_TO_COMPARE = 200  # below this the estimate is too coarse
+CHECK_TIME_S = 10.0  # at most, for `Endpoint.check`; a server may be loading its model
+SHORT = Query("1 2 3", max_tokens=1)  # the request of `Endpoint.check`
 
 Result = TypeVar("Result")
 
@@ -74,6 +76,22 @@ class Endpoint:
         if queries and sampling.n > 0:
             _run(_Plan(self, queries, tally, sampling).carry_out())
         return tally.answers()
+
+    def check(self) -> None:
+        """One short request. Raises `ModelError` where nothing listens at the address, or the key, the address or the
+        model is refused; a server that is slow or busy passes."""
+
+        async def ask() -> None:
+            async with contextlib.aclosing(self.connection()) as connection:
+                await self.learn(connection, CHECK_TIME_S)
+                while await self.ask(connection, SHORT, 1, 0.0, 0, CHECK_TIME_S) is None:
+                    pass  # in another dialect
+
+        try:
+            _run(ask())
+        except UnavailableError as failure:
+            if failure.absent:
+                raise self.absent(failure) from None
 
     def close(self) -> None:
         """Nothing is held between plans."""
@@ -189,6 +207,9 @@ class Endpoint:
             raise ModelError(f"{self.url} refused the request for {self.name}: {words}{advice}")
         self.dialect = changed
 
+    def absent(self, failure: UnavailableError) -> ModelError:
+        return ModelError(f"nothing answers at {self.url} ({failure}); is the server running, and the address right?")
+
     def _refuse_truncated(self, query: Query, read: int) -> None:
         sent = estimate_tokens(query.text)
         if sent >= MIN_TOKENS_TO_COMPARE and 0 < read < TRUNCATED_SHARE * sent:
@@ -283,10 +304,7 @@ class _Plan:
                 self._last_failure = str(failure)
                 self._unreachable = self._unreachable + 1 if failure.absent else 0
                 if self._unreachable >= MAX_UNREACHABLE:
-                    raise ModelError(
-                        f"nothing answers at {self._endpoint.url} ({failure}); is the server running, and the address "
-                        "right?"
-                    ) from None
+                    raise self._endpoint.absent(failure) from None
                 # The pause is a lower bound, also if the server asks for a shorter one.
                 await asyncio.sleep(max(failure.wait_s, pause * random.uniform(0.5, 1.0)))
                 pause = min(2 * pause, LONGEST_PAUSE_S)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import os
 import re
-import stat
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from robust_instant_policy.errors import MissingExtraError, ModelError
-from robust_instant_policy.files import NO_SPACE
+from robust_instant_policy.files import NO_SPACE, others_can_write, sha256
 from robust_instant_policy.llm.llama import LlamaModel
 
 EMBEDDED_NAME = "gemma-3-270m-q4_k_m-numbers"
@@ -60,7 +58,7 @@ def embedded_path() -> Path:
         _refuse_shared(path.parent)
         if path.exists():
             _refuse_shared(path)
-            if _sha256(path) == CUT_SHA256:
+            if sha256(path) == CUT_SHA256:
                 return path
         _make(path)
     except OSError as error:
@@ -80,7 +78,7 @@ def _make(path: Path) -> None:
     whole = path.with_name(f"{package.MODEL_NAME}.{os.getpid()}.part")
     try:
         package.assemble(whole)
-        is_sound = _sha256(whole) == WHOLE_SHA256
+        is_sound = sha256(whole) == WHOLE_SHA256
         if is_sound:
             cut_vocabulary(whole, path, _is_kept)
     except (OSError, ValueError, ModuleNotFoundError) as error:
@@ -91,7 +89,7 @@ def _make(path: Path) -> None:
         whole.unlink(missing_ok=True)
     if not is_sound:
         raise _damaged("another SHA-256")
-    if _sha256(path) != CUT_SHA256:
+    if sha256(path) != CUT_SHA256:
         path.unlink()
         raise ModelError(f"the installed gguf writes the embedded model differently; run: pip install {WRITER}")
     if is_first:
@@ -157,9 +155,7 @@ def _damaged(reason: str) -> ModelError:
 
 
 def _refuse_shared(path: Path) -> None:
-    """Another user could exchange the model between its check and its use."""
-    status = path.stat()
-    if status.st_uid not in (0, os.geteuid()) or stat.S_IMODE(status.st_mode) & 0o022:
+    if others_can_write(path):
         raise ModelError(
             f"other users can write to {path}; run chmod go-w on it, or name a folder of your own in XDG_CACHE_HOME"
         )
@@ -167,8 +163,3 @@ def _refuse_shared(path: Path) -> None:
 
 def _is_kept(piece: str, kind: int) -> bool:
     return kind == _BYTE or (kind in (_NORMAL, _USER_DEFINED) and _KEPT.fullmatch(piece) is not None)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -181,13 +181,18 @@ class Space:
         return np.stack(columns, axis=1).clip(0.0)
 
 
+def minimum_jerk(share: FloatArray) -> FloatArray:
+    """Position, 0 to 1, at a ``share`` of the time, 0 to 1, of a motion that starts and ends at rest."""
+    return share**3 * (10 - 15 * share + 6 * share**2)
+
+
 def joint_motion(start: FloatArray, goal: FloatArray, fingers: FloatArray, arms: Sequence[Arm], rate_hz: float,
                  speed: float = 1.0) -> Motion:  # fmt: skip
     """Straight motion of joints ``(A, J)`` from ``start`` to ``goal`` with a minimum-jerk profile, fingers at rest."""
     peak = 1.875  # of the speed of a minimum-jerk motion over its mean
     seconds = max(float((peak * np.abs(goal - start).max(axis=1) / [arm.joint_speed for arm in arms]).max()), 0.2)
     share = np.linspace(0.0, 1.0, max(math.ceil(seconds * rate_hz / speed), 2) + 1)[1:, None, None]
-    share = share**3 * (10 - 15 * share + 6 * share**2)
+    share = minimum_jerk(share)
     joints = start + share * (goal - start)
     poses = np.stack(
         [[arm.kinematics.tool_pose(row) for row in joints[:, index]] for index, arm in enumerate(arms)], axis=1

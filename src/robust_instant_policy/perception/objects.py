@@ -38,7 +38,7 @@ from robust_instant_policy.perception.models import (
 )
 from robust_instant_policy.perception.parts import MIN_GAIN, candidate_parts, gain
 from robust_instant_policy.perception.pieces import UNRELATED
-from robust_instant_policy.perception.registration import COLOUR_CAP_M, KEPT_COLOUR_CAP_M, polish, refine
+from robust_instant_policy.perception.registration import COLOUR_CAP_M, KEPT_COLOUR_CAP_M, refine, refine_pose
 from robust_instant_policy.perception.surroundings import Surroundings, grid_around, shown
 from robust_instant_policy.perception.view import View
 
@@ -50,10 +50,10 @@ MAX_HAND_LOSS = 12.0  # of the logarithm of a motion's chance, for one place of 
 ALIGNMENT_ROUNDS = 3  # over all demonstrations
 MIN_FITNESS = 0.15  # of an object's registration in every demonstration
 SAME_THING_FITNESS = 0.5  # things of one kind in other colours have 0.3, in the same 0.7
-MAX_OBJECTS = 30
+MAX_OBJECTS = 30  # with their parts
 SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
 MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
-TOUCH_M = 0.03
+TOUCH_M = 0.03  # between a part and its object in the reference image
 
 Pair = tuple[Registration, Registration]
 
@@ -161,7 +161,9 @@ def _aligned(
         if (pose != one.pose).any():
             similarity = similarity_in(model.templates, views[i])
             source = model.templates[one.template].xyzrgb
-            pose, fitness, similar = polish(pose, source, views[i].target, similarity, views[i].hides, model.colour_cap)
+            pose, fitness, similar = refine_pose(
+                pose, source, views[i].target, similarity, views[i].hides, model.colour_cap
+            )
             one = Registration(pose, fitness, similar, one.template)
         aligned.append(one)
     agreed = np.array([states[k][chosen[k]] for k in range(len(views))])

@@ -18,7 +18,7 @@ HIDDEN_GAP_M = 0.020  # nor those of such pixels this near in a horizontal direc
 STRIP_M = 0.035  # that an arm or a rod above the table may hide between two pieces of one thing
 SAME_COLOUR = 0.2  # greatest difference of the mean colours of such pieces, of a range of 1
 MIN_TOLD_SHARE = 1 / 3  # of the size of an object: smaller pieces are noise
-MAX_TOLD = 3
+MAX_TOLD = 3  # of them that a note names
 BORDER_SHARE = 0.01  # of the image's width and height, at its border
 HOVERING_M = 0.06  # above the table where it crosses the image's border: an arm or a person
 

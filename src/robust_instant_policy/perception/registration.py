@@ -27,10 +27,10 @@ from robust_instant_policy.geometry import (
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 
 # Votes.
-ANGLE_BINS = 24
-SHIFT_BIN_M = 0.015
-MAX_PEAKS = 4
-SUPPRESSED_BINS = 3  # around a peak, on each side
+ANGLE_BINS = 24  # of a full turn
+SHIFT_BIN_M = 0.015  # edge of a bin of translations
+MAX_PEAKS = 4  # motions that go on to ICP
+SUPPRESSED_BINS = 3  # around a peak, on each side, in which no other peak is taken
 MATCHES_PER_POINT = 3
 MAX_MATCHES = 400  # the most similar; more do not change the peaks
 VOTE_EXPONENT = 4  # of the similarity, for a match's vote
@@ -39,31 +39,31 @@ COLOUR_CAP_M = 0.010  # greatest colour distance: objects of one kind have many 
 KEPT_COLOUR_CAP_M = 0.020  # but not an object that keeps its own
 RESIDUAL_M = 0.010  # at which a point counts 1/e in the fitness
 OWN_REACH_M = 0.04  # image points further from the object belong to others
-RESTART_ANGLES = np.deg2rad([0.0, -25.0, 25.0])
-COARSE_POINTS = 60
-FINALISTS = 3
-MAX_BEHIND = 0.06  # of a finalist's score
+RESTART_ANGLES = np.deg2rad([0.0, -25.0, 25.0])  # turns of each voted motion from which ICP starts
+COARSE_POINTS = 60  # of the object in coarse ICP; three times as many of the image
+FINALISTS = 3  # motions that are refined with all points
+MAX_BEHIND = 0.06  # by which a finalist's score is below the best one, at most
 SAME_SHIFT_M, SAME_TURN_RAD = 0.005, np.deg2rad(5.0)  # between motions that ICP brings to one
-COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)  # kernel width in each iteration
+# Kernel width in each iteration: with few points, with all, and of `register_translation`.
+COARSE_REACH_M = (0.06, 0.04, 0.03, 0.02)
 FINE_REACH_M = (0.02, 0.015, 0.015, 0.01, 0.01)
 LOCAL_REACH_M = (0.03, 0.025, 0.02, 0.015, 0.015)
 HIDDEN_WEIGHT = 0.5  # of a point that something hides, which counts as one without a match, beside one that is seen
 MIN_WEIGHT = np.float32(1e-9)  # keeps the weights' sum above zero
 # Symmetry and rivals.
-SMALL_TURNS = np.deg2rad(np.arange(-20.0, 25.0, 5.0))  # the middle one is none
+SMALL_TURNS = np.deg2rad(np.arange(-20.0, 25.0, 5.0))  # that test symmetry; the middle one is 0
 MAX_SYMMETRY_LOSS = 0.04  # of the fitness, by small turns, for a rotationally symmetric object
 SIMILARITY_SCALE = 0.01  # of the softmax over small turns
-LARGE_TURNS = np.deg2rad(np.arange(30.0, 360.0, 30.0))
+LARGE_TURNS = np.deg2rad(np.arange(30.0, 360.0, 30.0))  # from the best motion to its rivals
 SLIDES_M = 0.025 * np.array(
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]
 )
 RIVAL_REACH_M = (0.02, 0.015)
-
-# Shape.
-MIN_SHAPE_POINTS = 25
-EXTENT_PERCENTILES = (2.0, 98.0)
-MIN_EXTENT_M = 0.01  # flatter things are not stretched
-MAX_STRETCH = 1.4
+# Size.
+MIN_SHAPE_POINTS = 25  # of an object in the image; with fewer its size is not fitted
+EXTENT_PERCENTILES = (2.0, 98.0)  # of the points along an axis: where an object begins and ends
+MIN_EXTENT_M = 0.01  # an object that is flatter along an axis is not stretched along it
+MAX_STRETCH = 1.4  # factor, and its inverse
 
 Similarity = Callable[[FloatArray], FloatArray]
 Hidden = Callable[[FloatArray], NDArray[np.bool_]]
@@ -173,7 +173,7 @@ def find_rivals(
     return Candidates(every, icp(every, *coarse, (), hidden, cap)[1], similarity(every))
 
 
-def polish(
+def refine_pose(
     motion: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden, cap: float
 ) -> tuple[FloatArray, float, float]:
     """``motion (4, 4)`` after ICP with all points, with its fitness and similarity."""

@@ -45,7 +45,7 @@ from robust_instant_policy.trajectory import ACTION_DIM, Trajectory
 MAX_CENTRE_OFFSET = 0.4  # of the principal point from the image centre, of half the image
 SPACING_M = 0.003  # between points, where the image has as many: enough for millimetres, and fast
 UNBOUNDED = np.array([[-np.inf] * 3, [np.inf] * 3])  # metres
-MIN_STEADY_PIXELS = 100
+MIN_STEADY_PIXELS = 100  # with depth, of an image
 MIN_OBJECT_M2 = 1.5e-4  # of the image of an object
 MIN_OBJECT_POINTS = 12  # fewer have no shape
 MIN_DISTANCE_SMOOTHED = 4.0  # Mahalanobis distance of a flat point's smoothed colour from the table's,

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from robust_instant_policy.errors import DatasetError, MissingExtraError, ModelError
-from robust_instant_policy.files import excerpt, read_json
+from robust_instant_policy.files import excerpt, others_can_write, read_json, sha256
 from robust_instant_policy.perception.settings import IMAGENET_DEVIATION, IMAGENET_MEAN
 
 HUB_TIMEOUT_S = 3.0
 WEIGHT_FILES = ("model.safetensors", "model.safetensors.index.json", "pytorch_model.bin")
 HEAD_DIM = 64  # of every DINO and DINOv2 model; for weights without a config.json
 SUPPORTED = ("vit", "dinov2", "dinov2_with_registers")
+SHA256 = re.compile(r"[0-9a-f]{64}")
 MAX_LISTED_TENSORS = 6  # in an error message
 
 
@@ -32,7 +34,8 @@ def load_checkpoint(source: str) -> VitCheckpoint:
     """The model at ``source``: a folder, a ``.safetensors`` file, or a name on the hub (``owner/model``).
 
     A name may end in ``@revision``, a commit of the hub's repository. The local cache goes before the hub; without a
-    connection the error comes within seconds. Raises `ModelError`, one line, and `MissingExtraError`.
+    connection the error comes within seconds. What the hub sent is checked at every use (`_checked`). Raises
+    `ModelError`, one line, and `MissingExtraError`.
     """
     for package in ("torch", "transformers", "safetensors"):
         if importlib.util.find_spec(package) is None:
@@ -44,7 +47,7 @@ def load_checkpoint(source: str) -> VitCheckpoint:
         return _from_file(path)
     if path.suffix == ".safetensors" or source.count("/") != 1 or source.startswith((".", "/", "~")):
         raise ModelError(f"there is no folder or file {source!r}, and it is not a name on the hub (owner/model)")
-    return _from_folder(cached_folder(source) or _download(source))
+    return _from_folder(_checked(cached_folder(source) or _download(source)))
 
 
 def cached_folder(name: str) -> Path | None:
@@ -79,6 +82,23 @@ def _download(name: str) -> Path:
             f"the weights of {name} are not in the local cache and the hub cannot provide them ({excerpt(error)}); "
             "copy them here and pass the folder, or use features='efficientnet'"
         ) from error
+
+
+def _checked(folder: Path) -> Path:
+    """The ``folder`` of a snapshot in the hub's cache, which names the content of large files by their SHA-256.
+
+    Raises `ModelError` where the content is another, or where other users could exchange it.
+    """
+    for file in folder.iterdir():
+        content = file.resolve()
+        if any(others_can_write(path, in_own_group=False) for path in (folder, content.parent, content)):
+            raise ModelError(
+                f"other users can write to {content}; run chmod -R go-w on {folder.parents[1]}, or name a folder of "
+                "your own in HF_HOME"
+            )
+        if SHA256.fullmatch(content.name) and sha256(content) != content.name:
+            raise ModelError(f"{file} has another SHA-256 than the hub gave for it; remove {folder.parents[1]}")
+    return folder
 
 
 def _from_folder(folder: Path) -> VitCheckpoint:

@@ -105,6 +105,7 @@ def make_plan(
         warnings=sum(finding.severity == "warning" for finding in findings) - doubts(findings),
         errors=len(errors(findings)),
         undecided=undecided(findings),
+        doubled=len(scene.located.doubled),
         unexplained=worst,
     )
     unknown = evidence.unknown_notes if judged else ()

@@ -34,8 +34,12 @@ UNKNOWN_NOTE = (
 )
 
 UNDECIDED_NOTE = (
-    "unchecked: it could not be decided whether images and paths of the demonstrations belong together; "
+    "unchecked: it could not be decided whether images and paths belong together, or depth is missing; "
     f"the confidence is at most {UNKNOWN}"
+)
+
+DOUBLED_NOTE = (
+    f"unchecked: it is not known which of two things of one look is meant; the confidence is at most {UNKNOWN}"
 )
 
 DISTORTED = 3.0  # `Evidence.distortion` above which a thing is another one than was demonstrated, or found wrongly
@@ -54,6 +58,7 @@ NOISE_M = 0.02  # variation of a coordinate below which it says nothing about a 
 RIGID_M = 0.010  # variation of the distance of two keypoints below which they belong to one rigid thing
 DISTANCE_M = 0.003  # with which a distance between keypoints is measured
 RECORDING = {"gripper state", "grasp", "rotation"}  # kinds of findings
+UNDECIDED = {"contact", "hole"}
 MIN_SCENES = 3  # below which nothing is known of their variation
 
 
@@ -68,7 +73,7 @@ class Evidence:
     scene lies from the demonstrations (see `novelty`); ``displacement``, metres, of the plan against what lies around
     the gripper, and ``precision``, that of the demonstrations (`Surroundings`); how many findings are ``doubts`` about
     the recording (`doubts`), other ``warnings``, and ``errors``, and how many warnings leave images and paths
-    ``undecided`` (`undecided`).
+    ``undecided`` (`undecided`); how many objects with keypoints are ``doubled``: it is not known which is meant.
     """
 
     agreement: float
@@ -82,6 +87,7 @@ class Evidence:
     warnings: int
     errors: int
     undecided: int = 0
+    doubled: int = 0
     unexplained: float = float("nan")
 
     @property
@@ -99,6 +105,7 @@ class Evidence:
         reasons = {
             UNKNOWN_NOTE: not (np.isfinite(self.prediction) and np.isfinite(self.novelty)),
             UNDECIDED_NOTE: self.undecided > 0,
+            DOUBLED_NOTE: self.doubled > 0,
             distorted: self.distortion > DISTORTED,
             unexplained: self.unexplained > UNEXPLAINED_M,
         }
@@ -141,8 +148,9 @@ def doubts(findings: Sequence[Finding]) -> int:
 
 
 def undecided(findings: Sequence[Finding]) -> int:
-    """How many ``findings`` are warnings that images and paths fit no better, or less well, than under a mistake."""
-    return sum(f.severity == "warning" and f.kind == "contact" for f in findings)
+    """How many ``findings`` are warnings that images and paths fit no better, or less well, than under a mistake, or
+    that depth is missing where a thing may be."""
+    return sum(f.severity == "warning" and f.kind in UNDECIDED for f in findings)
 
 
 def prediction(errors: FloatArray) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from robust_instant_policy.checks import checked_positive
+from robust_instant_policy.checks import checked_positive, is_finite
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError, KeypointError, PlanningError
@@ -248,9 +248,7 @@ def _array(content: dict, name: str, sizes: dict[str, int]) -> NDArray:
 def _stage(content: dict) -> Stage:
     stage = Stage(**content)
     if not isinstance(stage.name, str) or not all(
-        isinstance(value, int | float) and 0 <= value < math.inf
-        for name, value in vars(stage).items()
-        if name != "name"
+        is_finite(value) and value >= 0 for name, value in vars(stage).items() if name != "name"
     ):
         raise ValueError("its usage holds something other than a name and what a stage cost")
     return stage
@@ -267,7 +265,7 @@ def _frame(content: dict) -> FrameUse:
 
 
 def _checked_evidence(value: object) -> dict[str, float]:
-    if not isinstance(value, dict) or not all(isinstance(v, int | float) and math.isfinite(v) for v in value.values()):
+    if not isinstance(value, dict) or not all(map(is_finite, value.values())):
         raise ValueError("its evidence is not a map of numbers")
     return {name: float(number) for name, number in value.items()}
 

@@ -15,7 +15,7 @@ from plotly.offline import get_plotlyjs
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import open_regular, read_regular, write_whole
+from robust_instant_policy.files import open_regular, parse_json, read_regular, write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.policy import Plan, Stage
 from robust_instant_policy.reporting.charts import (
@@ -84,7 +84,7 @@ class RunRecord:
     def load(cls, folder: Path) -> RunRecord:
         """Raises `DatasetError` if ``folder`` holds no run, or a damaged one."""
         try:
-            content = json.loads(read_regular(folder / RUN_FILE))
+            content = parse_json(read_regular(folder / RUN_FILE))
             record = cls(**{**content, "stages": tuple(Stage(**stage) for stage in content["stages"])})
             _stage_table(record.stages)
             return record

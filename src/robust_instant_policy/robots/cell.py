@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -36,6 +37,7 @@ from robust_instant_policy.motion.limits import (
 
 CELLS = Path(__file__).with_name("cells")  # those that come with the package: emulated ones
 MIN_CONFIDENCE = 0.9  # of a plan; below it `rip run` refuses (docs/trust.md)
+LARGEST = sys.float_info.max  # TOML has integers of any length, and inf
 FAR_M = 5.0  # from the world's origin; more is a length in millimetres
 SPEEDS = {"joint_speed": 2 * math.pi, "joint_acceleration": 100.0, "tool_speed": 2.0}  # rad/s, rad/s², m/s at most
 PACES = 0.1, 1000.0
@@ -58,7 +60,7 @@ class Section:
             raise self.error(key, f"must be {'one of ' + ', '.join(choices) if choices else 'text'}, not {value!r}")
         return value
 
-    def number(self, key: str, default: float | None = None, least: float = -math.inf, most: float = math.inf) -> float:
+    def number(self, key: str, default: float | None = None, least: float = -LARGEST, most: float = LARGEST) -> float:
         value = self._take(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
             raise self.error(key, f"must be a number from {least:g} to {most:g}, not {value!r}")
@@ -83,7 +85,7 @@ class Section:
         words = " x ".join("N" if size is None else str(size) for size in shape)
         try:
             array = np.array(value, dtype=np.float64)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             raise self.error(key, f"must be {words} numbers, not {str(value)[:80]}") from None
         fits = array.ndim == len(shape) and all(
             want in (size, None) for size, want in zip(array.shape, shape, strict=True)

@@ -29,7 +29,6 @@ RETRY_TIMEOUTS = 2.1  # after so many of them no new try begins: the last one en
 TURN = 4096  # position units in one turn
 ZERO = 2048  # position of angle 0
 VELOCITY_UNIT = 0.229 * 2 * math.pi / 60  # rad/s
-CURRENT_UNIT_A = 2.69e-3
 ALERT = 0x80  # bit of a status packet's error: the hardware error register is not 0
 
 
@@ -46,8 +45,6 @@ MODEL = Register(0, 2)
 DRIVE_MODE = Register(10, 1)
 OPERATING_MODE = Register(11, 1)
 SHADOW_ID = Register(12, 1)
-HOMING_OFFSET = Register(20, 4, signed=True)
-CURRENT_LIMIT = Register(38, 2)
 TORQUE = Register(64, 1)
 HARDWARE_ERROR = Register(70, 1)
 BUS_WATCHDOG = Register(98, 1)
@@ -62,7 +59,7 @@ PRESENT_POSITION = Register(132, 4, signed=True)
 TEMPERATURE = Register(146, 1)
 VOLTAGE = Register(144, 2)  # 0.1 V
 
-POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE = 3, 4, 5
+POSITION_MODE, CURRENT_POSITION_MODE = 3, 5
 TICK_TURN = 32768
 MODEL_NAMES = {1020: "XM430-W350", 1030: "XM430-W210", 1060: "XL430-W250", 1120: "XM540-W270", 1130: "XM540-W150",
                1190: "XL330-M077", 1200: "XL330-M288"}  # fmt: skip

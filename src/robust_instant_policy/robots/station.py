@@ -21,6 +21,7 @@ from robust_instant_policy.errors import CellError, RobotError, StoppedError, Un
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.gate import STALE_S, Gate
+from robust_instant_policy.motion.guard import minimum_jerk
 from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.follower import Follower
@@ -30,11 +31,11 @@ from robust_instant_policy.robots.path import MeasuredPath, tool_points
 from robust_instant_policy.robots.priority import CONTROL, real_time
 from robust_instant_policy.robots.signals import StopRequest
 
-BRAKING_S = 0.24  # in which a motion is brought to rest when somebody asks for it
-BLENDING_S = 0.5  # in which the difference between measured joints and the first command is taken back
+BRAKING_S = 0.24  # time in which a motion is brought to rest on request
+BLENDING_S = 0.5  # time in which the difference between measured joints and the motion's first ones fades out
 START_RAD = 0.1  # largest such difference
 HOLDING = "the arms hold their position"
-EMULATED_STALE_S = 0.5, 0.2  # at most and at least: an emulation shares the processor with what uses it
+EMULATED_STALE_S = 0.5, 0.2  # greatest age of a state, at pace 1 and at any pace: an emulation shares the processor
 
 
 @dataclass(frozen=True)
@@ -134,9 +135,8 @@ class Station:
             if position >= last or stride <= 0:
                 return None
             position, step = min(position + stride, float(last)), step + 1
-            share = max(1 - step / blending, 0.0)
             joints, fingers = _between(motion, position)
-            joints = joints + share**3 * (10 - 15 * share + 6 * share**2) * offset
+            joints = joints + minimum_jerk(np.maximum(1 - step / blending, 0.0)) * offset
             before = np.array([one.finger_travel for one in self.gate.last])  # the fingers may begin elsewhere, too
             fingers = before + np.clip(fingers - before, -most, most)
             return [Command(one, float(travel)) for one, travel in zip(joints, fingers, strict=True)]

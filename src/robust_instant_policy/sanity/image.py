@@ -8,14 +8,19 @@ import numpy as np
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.pointcloud import MILLIMETRES_ABOVE
+from robust_instant_policy.sanity.contact import GripperPath
 from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.view import View
 
 MIN_READINGS = 0.05  # share of the pixels that must have a steady depth
+COARSE = 0.005  # of the median depth: a greater smallest difference between readings comes from no camera
 UNIFORM = 3.0  # of 255; a colour image that varies less shows nothing
 SQUARE_PIXELS = 0.1  # relative difference of fx and fy that no camera has
 CENTRED = 0.2  # of the image's size that the principal point may lie from its middle
 BAND_M, BAND_ON_TABLE, BAND_ROWS = 0.03, 0.02, 3  # height off the table, share of a row still on it, rows of the grid
+HOLE_M = 0.012  # from a point to the nearest depth reading, from which on what is there was not measured
+WIDE_M, WIDER = 0.015, 1.5  # the same of a hole that may hide a thing, and so many times the demonstrations' holes
+NEAR_TABLE_M = 0.05  # height of fingertips over the table below which they work
 TILT_ERROR_RAD, TILT_WARNING_RAD = np.deg2rad(4.0), np.deg2rad(2.0)  # of the table against the world's z axis
 
 
@@ -48,11 +53,19 @@ def check_image(view: View) -> list[Finding]:
     if (median := float(np.median(raw))) > MILLIMETRES_ABOVE:
         words = f"depth has a median of {median:.0f}: it is in millimetres, and read as such; store metres"
         found.append(Finding("depth unit", "warning", words, {"median": median}, "millimetres"))
+    if (step := float(np.diff(np.unique(raw)).min(initial=np.inf))) > COARSE * median and np.isfinite(step):
+        words = f"depth has {len(np.unique(raw))} levels only, at least {step:.3g} apart: was it stored in 8 bits?"
+        found.append(Finding("depth levels", "warning", words, {"step": step}, "8 bits"))
     if (spread := float(view.rgb.std())) < UNIFORM:
         words = (
             f"the colour image is all the same (deviation {spread:.1f} of 255): is the lens covered, or the stream off?"
         )
         found.append(Finding("colour", "error", words, {"deviation": spread}, "black image"))
+    elif (observation.rgb == observation.rgb[..., :1]).all():
+        words = (
+            "the colour image has shades of grey only: is it the infrared stream? things of other colours look alike"
+        )
+        found.append(Finding("colour", "warning", words, cause="infrared"))
     if view.camera_height <= 0:
         words = f"the camera lies {-view.camera_height:.2f} m below the table that it sees"
         found.append(Finding("camera pose", "error", words, {"camera_height": view.camera_height}))
@@ -62,6 +75,36 @@ def check_image(view: View) -> list[Finding]:
         advice = "; the camera's pose is turned, or the depth is wrong"
         found.append(Finding("table", severity, words + advice, {"tilt": view.tilt}, "camera turned"))
     return found
+
+
+def check_holes(views: Sequence[View], paths: Sequence[GripperPath]) -> list[Finding]:
+    """Whether depth was read where grippers close, or work near the table."""
+    unseen = []
+    for view, path in zip(views, paths, strict=True):
+        low = path.fingers[view.above_plane(path.fingers) < NEAR_TABLE_M]
+        unseen.append((view.in_hole(np.concatenate([path.closings, low])) > HOLE_M).any())
+    if not (count := sum(unseen)):
+        return []
+    words = f"no depth was read where the gripper closes or works in {count} of {len(views)} demonstrations"
+    advice = (
+        "what it handles was not measured there, and keypoints may lie on other things; light it, or move the camera"
+    )
+    severity: Severity = "warning" if 2 * count >= len(views) else "unchecked"
+    return [Finding("hole", severity, f"{words}: {advice}", {"demonstrations": float(count)}, "depth missing")]
+
+
+def check_hole(view: View, demonstrated: float) -> list[Finding]:
+    """Whether a hole of the depth image may hide a thing.
+
+    ``demonstrated``: of the widest hole in the demonstrations' images, metres from its middle to its rim.
+    """
+    widest = float(view.holes.max())
+    if widest <= max(WIDE_M, WIDER * demonstrated):
+        return []
+    row, col = np.array(np.unravel_index(int(view.holes.argmax()), view.holes.shape)) * view.every
+    words = f"the depth image has a hole, {2e3 * widest:.0f} mm wide, at pixel ({col}, {row})"
+    advice = f"; the demonstrations' are at most {2e3 * demonstrated:.0f} mm wide: what is there was not measured"
+    return [Finding("hole", "warning", words + advice, {"hole_m": 2 * widest}, "depth missing")]
 
 
 def _band(height: FloatArray) -> tuple[int, int] | None:

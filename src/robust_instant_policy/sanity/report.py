@@ -17,7 +17,7 @@ from robust_instant_policy.sanity.envelope import Envelope
 from robust_instant_policy.sanity.episodes import check_episodes
 from robust_instant_policy.sanity.finding import DemonstrationError, Finding, GeometryError, Severity, errors
 from robust_instant_policy.sanity.geometry import Evidence, evidence
-from robust_instant_policy.sanity.image import check_each_image, check_image
+from robust_instant_policy.sanity.image import check_each_image, check_hole, check_holes, check_image
 from robust_instant_policy.sanity.images import ONE_SCENE_M, check_contact, scene_spread
 from robust_instant_policy.sanity.recording import (
     check_direction,
@@ -41,7 +41,7 @@ class Reference:
     ``plane (4,)`` of the table and ``centre (3,)`` on it; ``scenery`` of a fixed camera, None where there is none;
     ``evidence`` of paths and images; ``edges (I,)`` the ratios of colour and depth edges, as far as there are any;
     ``object_centres (I, 3)`` of what is raised in each scene, and ``scene_spread_m`` how far they spread (metres, NaN
-    unknown).
+    unknown); ``widest_hole`` of the depth images, metres from its middle to its rim.
     """
 
     plane: FloatArray
@@ -51,6 +51,7 @@ class Reference:
     edges: FloatArray
     object_centres: FloatArray
     scene_spread_m: float
+    widest_hole: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,7 @@ class SetReport:
         known = self.reference
         if known.scenery is not None:
             found += check_against_scenery(view, known.scenery)
-        found += check_table(view, known.plane, known.centre)
+        found += check_table(view, known.plane, known.centre) + check_hole(view, known.widest_hole)
         found += check_scene_agreement(agreement(view), known.edges)
         return (*found, *_check_novelty(view, known))
 
@@ -122,7 +123,7 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
     as_is = evidence(views, paths, poses)
     cameras = _check_cameras(views)
     found += cameras + check_rotations(demonstrations, as_is)
-    found += check_contact(demonstrations, views, paths, poses, as_is)
+    found += check_contact(demonstrations, views, paths, poses, as_is) + check_holes(views, paths)
     edges = [agreement(view) for view in views]
     found += check_tool_frame(demonstrations, views, as_is) + check_openings(demonstrations, views)
     found += check_fingers(demonstrations, views) + check_direction(demonstrations, views)
@@ -150,6 +151,7 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
         np.array([edge.ratio for edge in edges if np.isfinite(edge.ratio)]),
         np.array([view.object_centre for view in views]),
         spread,
+        max(float(view.holes.max()) for view in views),
     )
     return SetReport(tuple(found), Envelope.of(trajectories, plane), reference)
 

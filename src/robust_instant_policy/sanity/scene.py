@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, lift
 from robust_instant_policy.sanity.finding import Finding
 from robust_instant_policy.sanity.hypotheses import OF_DEPTH, OF_IMAGES, OF_POSE
 from robust_instant_policy.sanity.scenery import CameraChange, Likeness, Scenery, camera_change
@@ -17,6 +17,7 @@ BETTER = 0.1  # by which the sum of both shares must be larger under a hypothesi
 TABLE_M, TABLE_RAD = 0.02, np.deg2rad(2.0)  # that the table may differ from the demonstrations'
 MUCH_TEXTURE = 0.8  # from which texture survives another camera's resolution
 SAME_IN_WORLD = 0.3  # of the demonstrations' own correlation, of texture on the table seen by another camera
+RECALIBRATED_M = 0.015  # by which another calibration of the same camera may displace what it shows
 MISSING = 0.2  # share of the scenery without depth that no camera noise explains
 
 
@@ -56,11 +57,14 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
         "intrinsics": change.intrinsics,
     }
     if same_depth and same_texture and not explained:
-        if small:
+        displaced = _displaced(view, scenery.reference)
+        if small and displaced < RECALIBRATED_M:
             return found
+        numbers["displaced"] = displaced
         cause = _name_calibration(scenery.reference, observation, change)
         words = f"the picture is the demonstrations', but its camera is said to be {change}"
-        return [*found, Finding("camera", "error", f"{words}: {cause}", numbers, cause)]
+        places = f", which displaces what it shows by {displaced * 1e3:.0f} mm"
+        return [*found, Finding("camera", "error", f"{words}{places}: {cause}", numbers, cause)]
     if small:
         cause, words = explained or _unexplained(scenery, like, same_depth)
         return [*found, Finding("scenery", "error", words, {**numbers, "ratio": like.ratio}, cause)]
@@ -75,8 +79,16 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
     return found
 
 
+def _displaced(view: View, reference: Observation) -> float:
+    """Median distance, metres, of what is seen from where it would be with the camera of ``reference``."""
+    rows, cols = np.nonzero(np.isfinite(view.depth))
+    pixels = np.stack([cols, rows], axis=-1) * view.every
+    there = lift(pixels, view.depth[rows, cols], reference.intrinsics, reference.camera_pose)
+    return float(np.median(np.linalg.norm(view.points[rows, cols] - there, axis=-1)))
+
+
 def _name_calibration(old: Observation, new: Observation, change: CameraChange) -> str:
-    for hypothesis in OF_POSE:
+    for hypothesis in OF_POSE if not change.pose_within_calibration else ():
         if camera_change(old, hypothesis.correct(new)).pose_within_calibration:
             return f"{hypothesis.cause} is the demonstrations'; {hypothesis.remedy}"
     if not change.intrinsics_within_calibration:

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, median_filter
 from scipy.spatial import cKDTree
 
 from robust_instant_policy.demonstration import Observation
@@ -162,6 +162,29 @@ class View:
 
         NaN where a point is outside the image or nothing was read there; negative: in front of the surface.
         """
+        at, inside, distance = self._cells(points)
+        return np.where(inside, distance - self.depth[at], np.nan), inside & self.raised[at]
+
+    @cached_property
+    def holes(self) -> FloatArray:
+        """``(h, w)`` how far each cell lies inside a hole of the depth image, metres: 0 where depth was read, or where
+        what has none reaches the image's border."""
+        step = self.every
+        read = np.nan_to_num(self.observation.depth[::step, ::step]) > 0
+        if not read.any():
+            return np.zeros(read.shape)
+        spacing = step * float(np.nanmedian(self.depth)) / self.observation.intrinsics[0, 0]
+        return np.asarray(distance_transform_edt(binary_fill_holes(read) & ~read) * spacing)
+
+    def in_hole(self, points: FloatArray) -> FloatArray:
+        """``holes (N,)`` where ``points (N, 3)`` are seen, metres."""
+        at, inside, _ = self._cells(points)
+        return np.where(inside, self.holes[at], 0.0)
+
+    def _cells(
+        self, points: FloatArray
+    ) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_], FloatArray]:
+        """Row and column of ``points (N, 3)`` in the grid, whether they are inside, and their depth (metres)."""
         local = transform_points(invert_pose(self.observation.camera_pose), points)
         image = local @ self.observation.intrinsics.T
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -170,8 +193,7 @@ class View:
         inside = (local[:, 2] > 0) & np.isfinite(cells).all(axis=1)
         inside &= (cells >= 0).all(axis=1) & (cells[:, 0] < width) & (cells[:, 1] < height)
         col, row = np.where(inside[:, None], cells, 0).astype(np.intp).T
-        behind = np.where(inside, local[:, 2] - self.depth[row, col], np.nan)
-        return behind, inside & self.raised[row, col]
+        return (row, col), inside, local[:, 2]
 
 
 def coarse(observation: Observation, max_edge: int) -> Observation:

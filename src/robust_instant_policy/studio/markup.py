@@ -1,13 +1,14 @@
-"""HTML that the page shows."""
+"""HTML that the page shows, from the macros of ``templates/panel.html``. Every value is escaped."""
 
 from __future__ import annotations
 
 import base64
-import html
 import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
 from robust_instant_policy.geometry import FloatArray
@@ -16,50 +17,50 @@ from robust_instant_policy.policies import Context, LocatedScene, Plan
 
 BLUE, RED, GREEN, ORANGE, GREY = "#2e6f95", "#b3262e", "#2a7d3f", "#b35c00", "#5b6470"
 GOOD, FAIR = 0.9, 0.5  # confidence from which a plan is shown in green, and in orange
-SMALL = "font-size:0.85em;line-height:1.4"
-PICTURE_HEIGHT = "15em"
 MARGIN, LEAST_SHARE = 1.4, 0.3  # of the image that is shown: times the box of the keypoints, and at least
 KEYPOINT_PX = 5  # radius of a mark, where the picture is 256 pixels wide
 OBJECT_COLOURS = ("#e6194b", "#ffe119", "#4363d8", "#3cb44b", "#f58231", "#911eb4", "#42d4f4", "#f032e6")
 
 Colour = tuple[int, int, int]
 
+_ENVIRONMENT = Environment(
+    loader=PackageLoader(__package__), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+)
+
+
+def _html(macro: str, *values: Any) -> str:
+    """A plain string: viser sends no other kind."""
+    return str(getattr(_ENVIRONMENT.get_template("panel.html").module, macro)(*values))
+
 
 def box(colour: str, text: str, name: str = "") -> str:
     """HTML of ``text`` on ``colour``; ``name`` is the element's id."""
-    return (
-        f'<div id="{name}" style="background:{colour};color:#fff;font-size:1.02em;line-height:1.35;padding:0.6em 0.8em;'
-        f'margin:0.3em 0.5em;border-radius:6px">{html.escape(text)}</div>'
-    )
+    return _html("box", colour, text, name)
 
 
 def line(text: str) -> str:
     """HTML of a line of ``text``."""
-    return f'<div style="padding:0.2em 0.8em;{SMALL}">{html.escape(text)}</div>'
+    return _html("line", text)
 
 
 def legend(*entries: tuple[str, Colour, str]) -> str:
     """HTML that explains colours: a name, its colour, and what more is to be said, for each of ``entries``."""
-    marks = (
-        f'<span style="color:rgb{colour}">&#9632;</span> {html.escape(name)}{html.escape(more and f" ({more})")}'
-        for name, colour, more in entries
-    )
-    return f'<div style="padding:0.2em 0.8em;{SMALL}">{", ".join(marks)}</div>'
+    return _html("legend", entries)
 
 
 def prompt(text: str) -> str:
     """HTML of the ``text`` that the language model is given."""
-    return f'<pre style="max-height:20em;overflow:auto;font-size:0.75em;padding:0 0.8em">{html.escape(text)}</pre>'
+    return _html("prompt", text)
+
+
+def script(text: str) -> str:
+    """HTML that runs the JavaScript ``text``."""
+    return _html("script", text)
 
 
 def comparison(rows: Sequence[tuple[str, Colour, str]]) -> str:
     """HTML of a table with a method, its colour and its outcome in each of ``rows``."""
-    cells = (
-        f'<tr><td style="color:rgb{colour};font-weight:bold;padding-right:1em">{html.escape(method)}</td>'
-        f"<td>{html.escape(outcome)}</td></tr>"
-        for method, colour, outcome in rows
-    )
-    return f'<table style="margin:0.5em 0.8em">{"".join(cells)}</table>'
+    return _html("comparison", rows)
 
 
 def trust(plan: Plan, available: int, complete: bool) -> str:
@@ -74,16 +75,7 @@ def trust(plan: Plan, available: int, complete: bool) -> str:
         return box(GREY, f"{words}; more follow, then the confidence")
     confidence = plan.confidence or 0.0
     colour = GREEN if confidence >= GOOD else ORANGE if confidence >= FAIR else RED
-    evidence = "".join(
-        f"<tr><td style='padding-right:1em'>{html.escape(name)}</td><td>{round(value, 3):g}</td></tr>"
-        for name, value in plan.evidence.items()
-    )
-    notes = "".join(f"<li>{html.escape(note)}</li>" for note in plan.notes)
-    told = box(colour, f"Confidence {confidence:.2f}: {words}")
-    return (
-        f"{told}<details style='padding:0 0.8em;{SMALL}'><summary>Reasons</summary>"
-        f"<table>{evidence}</table><ul style='padding-left:1.2em'>{notes}</ul></details>"
-    )
+    return _html("trust", colour, f"Confidence {confidence:.2f}: {words}", plan.evidence, plan.notes)
 
 
 def keypoint_picture(rgb: np.ndarray, context: Context | None = None, scene: LocatedScene | None = None) -> str:
@@ -96,18 +88,11 @@ def keypoint_picture(rgb: np.ndarray, context: Context | None = None, scene: Loc
     if context is not None and scene is not None:
         pixels = scene.located.pixels + 0.5
         part = _around(pixels, width, height)
-        size = part[2] / 256
-        for index, (u, v) in enumerate(pixels):
+        radius = KEYPOINT_PX * part[2] / 256
+        for index, pixel in enumerate(pixels):
             told, colour = _known(context, scene, index)
-            marks.append(
-                f'<circle class="keypoint" cx="{u:.1f}" cy="{v:.1f}" r="{KEYPOINT_PX * size:.1f}" fill="{colour}" '
-                f'stroke="#000" stroke-width="{size:.1f}"><title>{html.escape(told)}</title></circle>'
-            )
-    return (
-        f'<svg viewBox="{" ".join(f"{number:.1f}" for number in part)}" '
-        f'style="width:100%;max-height:{PICTURE_HEIGHT};border-radius:6px">'
-        f'<image href="data:image/jpeg;base64,{data}" width="{width}" height="{height}"/>{"".join(marks)}</svg>'
-    )
+            marks.append((pixel, radius, colour, told))
+    return _html("keypoint_picture", data, width, height, part.round(1), marks)
 
 
 def _around(pixels: FloatArray, width: int, height: int) -> FloatArray:

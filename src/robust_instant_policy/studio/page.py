@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -100,9 +99,7 @@ class Page:
         with self.tabs.add_tab("Act", viser.Icon.PLAYER_PLAY):
             self._acts = ActPanel(self._gui, server.scene, self.session, self._controls, self.plans)
         self._bind_keys()
-        # Browsers run no script element that is added to a page, but the handler of an image that cannot be loaded.
-        script = html.escape(GAMEPAD.read_text())
-        self._gui.add_html(f'<img src="data:," alt="" style="display:none" onerror="{script}">')
+        self._gui.add_html(markup.script(GAMEPAD.read_text()))
 
     @property
     def folder(self) -> Path:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
+from robust_instant_policy.geometry import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +17,3 @@ class SceneTruth:
     parts: NDArray[np.int64]
     names: tuple[str, ...]
     poses: FloatArray
-
-    def material_point(self, point: ArrayLike, part: str) -> FloatArray:
-        """World ``point (3,)`` in the frame of ``part``: constant over scenes for a material point."""
-        return transform_points(invert_pose(self.poses[self.names.index(part)]), point)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.errors import DatasetError, MissingExtraError
-from robust_instant_policy.files import excerpt, open_regular
+from robust_instant_policy.files import excerpt, open_regular, parse_json
 
 MAX_ARRAY_BYTES = 2**32  # of one array; the images of an episode are the largest
 
@@ -83,8 +82,8 @@ def read_json_attribute(group: Any, name: str) -> dict[str, Any]:
     where = f"{group.file.filename}: the attribute {name} of {excerpt(group.name)}"
     try:
         text = group.attrs.get(name, "{}")
-        content = json.loads(text) if isinstance(text, str | bytes) else None
-    except (ValueError, TypeError, RecursionError, OSError) as error:
+        content = parse_json(text) if isinstance(text, str | bytes) else None
+    except (ValueError, TypeError, OSError) as error:
         raise DatasetError(f"{where} is not JSON") from error
     if not isinstance(content, dict):
         raise DatasetError(f"{where} is not a JSON object")

@@ -49,7 +49,7 @@ FORMATS = {"DOUBLE": "d", "UINT64": "Q", "INT32": "i", "UINT32": "I", "UINT8": "
            "VECTOR3D": "3d", "VECTOR6D": "6d"}  # fmt: skip
 
 # Commands of the script that `ur_rtde` uploads, in the first integer register.
-SERVO_J, SERVO_STOP, STOP_J, SET_WATCHDOG, STOP_SCRIPT = 11, 16, 34, 35, 255
+SERVO_J, SET_WATCHDOG, STOP_SCRIPT = 11, 35, 255
 CONTINUOUS = {24, 11, 9, 10, 6, 25, 26, 27, 38, 58, *range(66, 72)}  # not answered with "done"
 READY, DONE = 1, 2
 RUNNING, STOPPED = 2, 1  # runtime states

@@ -17,30 +17,31 @@ from robust_instant_policy.errors import RendererError
 VARIABLE = "MUJOCO_GL"  # MuJoCo's variable; a value set by the user is kept
 BACKENDS = ("egl", "osmesa")
 TIMEOUT_S = 60
-MODULE = "robust_instant_policy.tasks.aloha.renderer"  # not `__name__`, which is "__main__" when it is run
 
 
 @cache
 def require_renderer() -> str:
     """Make MuJoCo render off screen and name the library; raises `RendererError` where none can."""
     backends = (os.environ[VARIABLE],) if os.environ.get(VARIABLE) else BACKENDS
-    answers = [_try(backend) for backend in backends]
-    works = [backend for backend, (success, _) in zip(backends, answers, strict=True) if success]
-    if not works:
-        said = "; ".join(f"{backend}: {answer}" for backend, (_, answer) in zip(backends, answers, strict=True))
-        raise RendererError(
-            f"MuJoCo has no renderer ({said}); run: make setup (or install libegl1 and libgl1-mesa-dri, or libosmesa6)"
-        )
-    os.environ[VARIABLE] = works[0]
-    if "mujoco" in sys.modules:  # imported before the library was selected
-        importlib.reload(importlib.import_module("mujoco.rendering.classic.gl_context"))
-    return dict(zip(backends, answers, strict=True))[works[0]][1]
+    said = []
+    for backend in backends:
+        success, answer = _try(backend)
+        if success:
+            os.environ[VARIABLE] = backend
+            if "mujoco" in sys.modules:  # imported before the library was selected
+                importlib.reload(importlib.import_module("mujoco.rendering.classic.gl_context"))
+            return answer
+        said.append(f"{backend}: {answer}")
+    raise RendererError(
+        f"MuJoCo has no renderer ({'; '.join(said)}); run: make setup (or install libegl1 and libgl1-mesa-dri, or "
+        "libosmesa6)"
+    )
 
 
 def _try(backend: str) -> tuple[bool, str]:
     """Whether ``backend`` renders, with its name or the reason of the failure."""
     environment = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
-    command = [sys.executable, "-m", MODULE, "once"]
+    command = [sys.executable, "-P", __file__, "once"]  # by its path, which does not import the package of tasks
     try:
         result = subprocess.run(
             command,
