@@ -79,6 +79,16 @@ def test_demonstrations_that_do_different_things_are_told_apart(family, number):
     assert "told apart by" in " ".join(prompt.notes())
 
 
+@pytest.mark.parametrize("number", [0, 3])
+def test_one_demonstration_that_contradicts_the_others_is_no_way_of_its_own(number):
+    keypoints, trajectories, draw = shown("place", 6, number=number)
+    late = np.arange(len(trajectories[0]))[:, None] >= 12
+    moved = trajectories[0].actions + late * np.append(np.tile([0.15, 0.1, 0.0], 3), 0)
+    prompt = write_prompt(keypoints, [Trajectory.from_actions(moved), *trajectories[1:]])
+    assert prompt.ways == (prompt,)
+    assert (errors(prompt, draw) < WITHIN_M).mean() > 0.5
+
+
 def test_things_alike_may_be_told_apart_by_their_distance_from_a_third():
     rng = np.random.default_rng(0)
     shapes = rng.uniform([-0.04, -0.04, 0], [0.04, 0.04, 0.03], (2, 3, 3))

@@ -287,3 +287,16 @@ def test_a_thing_of_another_colour_in_a_few_demonstrations_is_found_in_all():
     extractor = KeypointExtractor(6).fit([photograph(chest) for chest in chests], paths)
     off = extractor.keypoints_ - np.pad(middles, ((0, 0), (0, 1)))[:, None]
     assert np.abs(off[..., :2]).max() < 0.08
+
+
+@pytest.mark.parametrize("first", [5, 40])
+def test_of_two_alike_things_the_one_at_the_hand_is_the_grasped_one(first):
+    blue = ((40, 90, 180), (40, 90, 180))
+    scenes = [[(x, y, 0.035, 0.05, blue) for x, y in places(first + seed, 2)] for seed in range(5)]
+    images = [photograph(blocks) for blocks in scenes]
+    paths = [path_to(*blocks[0][:2]) for blocks in scenes]
+    extractor = KeypointExtractor(6, features="efficientnet").fit(images, paths)
+    found = np.array([owners(*one) for one in zip(extractor.pixels_, images, scenes, strict=True)])
+    of_grasped = found[:, found[0] == 0]
+    assert of_grasped.shape[1] >= 3
+    assert not of_grasped.any()

@@ -215,10 +215,11 @@ SURE = Evidence(
         {"novelty": 4.0},
         {"displacement": 0.04},
         {"precision": 0.04},
+        {"precision": np.inf},
         {"doubts": 1},
         {"warnings": 2},
     ],
-    ids=lambda worse: next(iter(worse)),
+    ids=str,
 )
 def test_confidence_falls_with_everything_that_speaks_against_a_plan(worse):
     assert plan_confidence(SURE) > 0.9
@@ -227,6 +228,7 @@ def test_confidence_falls_with_everything_that_speaks_against_a_plan(worse):
 
 def test_a_tie_or_an_error_of_a_check_leaves_no_confidence():
     assert plan_confidence(replace(SURE, agreement=0.0)) == 0
+    assert plan_confidence(replace(SURE, agreement=np.nan)) == 0
     assert plan_confidence(replace(SURE, errors=1)) == 0
 
 

@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from robust_instant_policy.context.choice import NOISE_M
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
@@ -22,7 +23,6 @@ MIN_CURVATURE_M = 0.003
 MIN_WARPED_STEPS = 4  # of a segment
 WARPING_ROUNDS = 5
 WAITING_M = 0.003  # cost of a step in which a demonstration waits for the others, or they for it
-NOISE_M = 0.003  # of demonstrated points
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def align(trajectories: Sequence[Trajectory]) -> AlignedDemonstrations:
         for part in range(len(order))
     ]
     parts = [
-        _in_step([trajectories[index].actions[slice(*segments[index][part][1:])] for index in kept], length)
+        _synchronised([trajectories[index].actions[slice(*segments[index][part][1:])] for index in kept], length)
         for part, length in enumerate(lengths)
     ]
     actions = np.concatenate(parts, axis=1)
@@ -95,7 +95,7 @@ def _segments(trajectory: Trajectory) -> list[tuple[tuple[int, ...], int, int]]:
     return [(states[start], start, stop) for start, stop in pairwise(edges)]
 
 
-def _in_step(segments: Sequence[FloatArray], length: int) -> FloatArray:
+def _synchronised(segments: Sequence[FloatArray], length: int) -> FloatArray:
     """One segment of all demonstrations, ``(n, 10·A)`` each, at ``length`` steps that mean the same: ``(I, length,
     10·A)``.
 

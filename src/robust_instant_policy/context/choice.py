@@ -41,6 +41,7 @@ TRANSITION_COST = 1.0  # of a change of frame between two steps, in logarithms o
 KEY_STEP_WEIGHT = 3.0  # of the first and last step and of gripper changes; 1 elsewhere
 # Expected error of a single demonstration, a metre to a thing that is seen in its own axes, and to one that has none.
 DISTANCE_SHARE, UNTURNED_SHARE = 0.05, 0.3
+TURN_WEIGHT = 0.6  # of the gripper's points about its centre against the centre, where a line is fitted
 MAX_LOOSE = 4  # keypoints of their own, between which lines are drawn
 UNEXPLAINED_M = 0.015  # error of a key step from which on more origins are tried
 # Where the numbers w stand: shares, three for each further end; points in the ends; offset; its growth with each size.
@@ -261,7 +262,7 @@ def choose_frames(
     candidates = Candidates.of(things, scene)
     errors = prediction_errors(candidates, hands, second)
     if len(hands) >= DEMOS_TO_TELL_THINGS:
-        candidates = _with_fitted_lines(candidates, errors, hands, weight, second)
+        candidates = _with_fitted_lines(candidates, errors, hands, second)
         errors = prediction_errors(candidates, hands, second)
         if errors.mean_squared[list(key_steps)].min(axis=(1, 2)).max() > UNEXPLAINED_M**2:
             candidates = candidates.with_more_origins(things)
@@ -286,16 +287,16 @@ def _viterbi(cost: FloatArray) -> list[int]:
 
 
 def _with_fitted_lines(
-    candidates: Candidates, errors: Errors, hands: FloatArray, weight: FloatArray, second: NDArray[np.bool_] | None
+    candidates: Candidates, errors: Errors, hands: FloatArray, second: NDArray[np.bool_] | None
 ) -> Candidates:
     """``candidates`` with those lines fitted that suit some step best."""
-    best = errors.cost.reshape(len(weight), -1).argmin(axis=1)
+    best = errors.cost.reshape(hands.shape[1], -1).argmin(axis=1)
     picks = np.stack(np.unravel_index(best, errors.cost.shape[1:]), axis=1)
     axes = list(candidates.axes)
     for index in np.unique(picks[:, 0]):
         if len(axes[index].ends) == 2:
             steps = np.flatnonzero(picks[:, 0] == index)
-            axes[index] = _fitted_line(candidates, int(index), hands[:, steps], picks[steps, 1], weight[steps], second)
+            axes[index] = _fitted_line(candidates, int(index), hands[:, steps], picks[steps, 1], second)
     return replace(candidates, axes=tuple(axes))
 
 
@@ -304,7 +305,6 @@ def _fitted_line(
     index: int,
     hands: FloatArray,
     origins: FloatArray,
-    weight: FloatArray,
     second: NDArray[np.bool_] | None,
 ) -> Axes:
     """Axes ``index`` with the ends between which the line predicts the ``hands (I, T, 3, 3)`` best, each step's origin
@@ -327,7 +327,7 @@ def _fitted_line(
         line = replace(candidates, axes=(moved(x),))
         rotation = line.rotations()[0]
         shape = np.einsum("iyx,itpy->tipx", rotation, hands - centre[:, :, None])
-        parts = [_from_mean(shape, second) * 0.6]
+        parts = [_from_mean(shape, second) * TURN_WEIGHT]
         start, (design, penalty) = line.start(home), line.design(home, second)
         for number, origin in enumerate(origins):
             flat = design[0, origin].reshape(-1, len(penalty))

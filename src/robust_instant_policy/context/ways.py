@@ -169,7 +169,19 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
             cost = _cost(squared) - min(margins[widest], 1.0)
             if best is None or cost < best[0]:
                 best = cost, *same[widest][:2], shared
-    return best[1:] if best is not None and best[0] + SPLIT_GAIN < one_way else None
+    if best is None or best[0] + SPLIT_GAIN >= one_way or _one_differs(things, scene, hands):
+        return None
+    return best[1:]
+
+
+def _one_differs(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> bool:
+    """Whether one way explains all demonstrations but a single one, which is rather an error than a way."""
+    every = np.arange(len(hands))
+    rests = (every[every != demo] for demo in every)
+    return any(
+        _squared(things, {thing: at.of(rest) for thing, at in scene.items()}, hands[rest]).max() < UNEXPLAINED_M**2
+        for rest in rests
+    )
 
 
 def _parted(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,10 +38,10 @@ BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
 KEPT_COLOUR_M = 0.008  # median over images of the distance in colour, for an object that keeps its colours
 HAND_REACH_M = 0.05  # of an object's points, at which a place of the hand counts 1/e
-MIN_NEAR = 0.2
+MIN_NEAR = 0.2  # of that count, from which on the hand handles an object
 HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
-MAX_HAND_LOSS = 12.0
-ALIGNMENT_ROUNDS = 3
+MAX_HAND_LOSS = 12.0  # of the logarithm of a motion's chance, for one place of the hand
+ALIGNMENT_ROUNDS = 3  # over all demonstrations
 EVIDENCE_SCALE = 8.0  # of the surroundings' evidence: neighbouring cells of the grid are not independent
 MIN_ADVANTAGE = 1.0  # of the logarithm of the chance, for a motion that replaces the one that ICP found
 MAX_RIVAL_LOSS = 6.0  # in units of RIVAL_SCALE, for a motion that the surroundings may speak for
@@ -154,7 +154,7 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
     pieces = list(home.pieces)
     models = [Model((_template_of(home, piece, seed),)) for piece in pieces]
     found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
-    handled = set()
+    handled: set[int] = set()
     if hands is not None and len(views) > 1:
         for number, model in enumerate(models):
             if _nearness(model, hands[0]).max() > MIN_NEAR:
@@ -185,10 +185,10 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
         members = [i for i, model in enumerate(models) if i == number or model.parent == number]
         family = (_template_of(home, np.concatenate([pieces[i] for i in members]), seed),)
         models[number] = replace(models[number], family=family)
-    things = [_complete(models, found, number, views, seed, number in handled) for number in range(len(models))]
+    things = [_complete(models, found, number, views, seed, handled) for number in range(len(models))]
     if all(thing.worst_fitness < MIN_FITNESS for thing in things):  # do they have other colours in some images?
         models = [replace(model, colour_cap=COLOUR_CAP_M) for model in models]
-        things = [_complete(models, found, number, views, seed, number in handled) for number in range(len(models))]
+        things = [_complete(models, found, number, views, seed, handled) for number in range(len(models))]
     shapes = [
         _shapes([thing.model for thing in things], [thing.registrations[i] for thing in things], view)
         for i, view in enumerate(views)
@@ -392,18 +392,19 @@ def _complete(
     number: int,
     views: Sequence[View],
     seed: int,
-    handled: bool,
+    handled: Collection[int],
 ) -> RigidObject:
-    """Object ``number`` with templates from all views, and registered with them; the best views come first. One that is
-    ``handled`` stays where the hand tells.
+    """Object ``number`` with templates from all views, and registered with them; the best views come first. Those that
+    are ``handled`` stay where the hand tells, and the others yield to them.
     """
     model, registrations = models[number], [row[number] for row in found]
     templates = list(model.templates)
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
-        better = [k for k in range(len(models)) if found[i][k].score > found[i][number].score]
+        rank = [(k in handled, one.score) for k, one in enumerate(found[i])]
+        better = [k for k in range(len(models)) if rank[k] > rank[number]]
         taken = _explained(models, found[i], better)
         start = registrations[i].pose[None]
-        if handled:
+        if number in handled:
             one = register(templates, views[i], taken, start, vote=False, colour_cap=model.colour_cap)
             registrations[i] = one if one.fitness else registrations[i]
         else:

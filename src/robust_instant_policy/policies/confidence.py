@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.special import expit
 
 from robust_instant_policy.geometry import FloatArray, robust_std
 from robust_instant_policy.sanity import Finding
@@ -120,7 +121,7 @@ class Evidence:
             / max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision))),
             "precision": self.precision / GOOD_PRECISION_M,
         }
-        ratios = {name: -float(np.log(max(ratio, 1.0))) for name, ratio in found.items() if np.isfinite(ratio)}
+        ratios = {name: -float(np.log(max(ratio, 1.0))) for name, ratio in found.items() if not np.isnan(ratio)}
         return {**dict.fromkeys(found, 0.0), **ratios, "doubts": -float(self.doubts), "warnings": -float(self.warnings)}
 
 
@@ -129,8 +130,8 @@ def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEF
     if evidence.errors:
         return 0.0
     score = coefficients["constant"] + sum(coefficients[name] * value for name, value in evidence.features().items())
-    vote = evidence.vote if np.isfinite(evidence.vote) else 1.0
-    probability = float(min(1.0, evidence.agreement / GOOD_AGREEMENT) * (1 + vote) / 2 / (1 + np.exp(-score)))
+    agreement, vote = np.nan_to_num(evidence.agreement), np.nan_to_num(evidence.vote, nan=1.0)
+    probability = float(min(1.0, agreement / GOOD_AGREEMENT) * (1 + vote) / 2 * expit(score))
     return UNKNOWN * probability if evidence.unknown_notes else probability
 
 
