@@ -680,7 +680,12 @@ def mutated_hdf5(draw: st.DrawFn, original: bytes) -> bytes:
             ):
                 case "text" if len(attributes):
                     key = draw(st.sampled_from(sorted(attributes)))
-                    attributes[key] = draw(mutated_json(json.loads(attributes[key]))).decode(errors="replace")[:60_000]
+                    try:
+                        known = json.loads(attributes[key])
+                    except ValueError:  # damaged by an earlier mutation
+                        continue
+                    text = draw(mutated_json(known)).decode(errors="replace")
+                    attributes[key] = text.replace("\0", "")[:15_000]  # HDF5 takes no null and 64 KiB of UTF-8
                     continue
                 case "replace":
                     value = draw(st.sampled_from(HDF5_VALUES))
