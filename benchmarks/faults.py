@@ -320,6 +320,13 @@ def mirrored_path(d: Demonstration) -> Demonstration:
     return replace(d, trajectory=Trajectory(own.reshape(len(own), -1), d.trajectory.times))
 
 
+def lost_tracking(d: Demonstration) -> Demonstration:
+    """The gripper is half a metre away at one step."""
+    own = d.trajectory.actions.copy().reshape(len(d.trajectory), -1, 10)
+    own[len(own) // 2, :, :9] += 0.5
+    return replace(d, trajectory=Trajectory(own.reshape(len(own), -1), d.trajectory.times))
+
+
 def longer(factor: int):
     def change(d: Demonstration) -> Demonstration:
         rows = np.repeat(d.trajectory.actions, factor, axis=0)
@@ -604,6 +611,8 @@ def _faults() -> dict[str, Fault]:
     add("fps-negative:demos", ("rate",), demonstrations=rates(-10.0))
     add("fps-nan:demos", ("rate",), demonstrations=rates(float("nan")))
     add("one-step:demos", ("step",), demonstrations=one(one_step))
+    add("jump-0.5m:demos", ("tracking",), demonstrations=one(lost_tracking))
+    add("rate-0.001:demos", ("rate",), demonstrations=rates(1e-3))
     add("100x-longer:demos", ("long",), demonstrations=one(longer(100)))
     add("cut-off:demos", ("contradict", "others", "short"), demonstrations=one(cut))
     add("contradicts:demos", ("demonstration 4", "contradict"), demonstrations=one(mirrored_path))

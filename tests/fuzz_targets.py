@@ -294,7 +294,7 @@ def observation_files(draw: st.DrawFn) -> bytes:
     compression = draw(st.sampled_from(kinds))
     with zipfile.ZipFile(buffer, "w", compression) as archive:
         for name, content in members.items():
-            archive.writestr(name, content)
+            archive.writestr(zipfile.ZipInfo(name), content, compression)  # without the time
     content = buffer.getvalue()
     match draw(st.sampled_from(["whole", "whole", "whole", "bytes", "other", "array"])):
         case "bytes":
@@ -680,7 +680,12 @@ def mutated_hdf5(draw: st.DrawFn, original: bytes) -> bytes:
             ):
                 case "text" if len(attributes):
                     key = draw(st.sampled_from(sorted(attributes)))
-                    attributes[key] = draw(mutated_json(json.loads(attributes[key]))).decode(errors="replace")[:60_000]
+                    try:
+                        known = json.loads(attributes[key])
+                    except ValueError:  # damaged by an earlier mutation
+                        continue
+                    text = draw(mutated_json(known)).decode(errors="replace")
+                    attributes[key] = text.replace("\0", "")[:15_000]  # HDF5 takes no null and 64 KiB of UTF-8
                     continue
                 case "replace":
                     value = draw(st.sampled_from(HDF5_VALUES))

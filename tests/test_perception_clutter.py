@@ -1,12 +1,13 @@
 """Keypoints on tables with several things: blocks of two colours, seen from above by a pinhole camera."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.geometry import make_pose, project
+from robust_instant_policy.geometry import GripperTriangle, make_pose, project
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.perception.view import make_view
 from robust_instant_policy.reporting.keypoints import keypoints_page
@@ -100,6 +101,21 @@ def test_most_keypoints_are_on_what_the_hand_grasps(grasped, least):
     extractor = KeypointExtractor(features="efficientnet").fit(images, paths)
     found = owners(extractor.pixels_[0], images[0], scenes[0])
     assert all(found.count(number) >= count for number, count in enumerate(least)), found
+
+
+def test_what_a_held_tool_is_moved_to_has_a_keypoint():
+    scenes = [blocks_at(seed, halves=(0.05, 0.025, 0.025)) for seed in range(5)]
+    images = [photograph(blocks) for blocks in scenes]
+    paths = []
+    for tool, thing in ((blocks[1], blocks[2]) for blocks in scenes):
+        hooked = np.array([thing[0] + 0.08, thing[1] - 0.06, 0.2])
+        stops = [(0.3, 0.3, 0.3), (*tool[:2], 0.05), (*tool[:2], 0.05), hooked, (-0.35, 0.0, 0.05)]
+        hand = np.concatenate([np.linspace(*pair, 10) for pair in pairwise(stops)])
+        poses = [make_pose(np.diag([1.0, -1, -1]), at) for at in hand]
+        paths.append(Trajectory.from_poses(poses, np.arange(40) >= 10, GripperTriangle(0.1, 0.06)))
+    extractor = KeypointExtractor(features="efficientnet").fit(images, paths)
+    found = owners(extractor.pixels_[0], images[0], scenes[0])
+    assert found.count(1) > found.count(2) > 0, found
 
 
 def test_more_pixels_do_not_lose_a_small_thing_and_a_smaller_one_is_told():

@@ -165,6 +165,7 @@ def test_planning_before_fitting_is_refused(observation):
         {"num_queries": 0},
         {"num_queries": True},
         {"num_steps": 2.5},
+        {"workspace": "x"},
         {"num_keypoints": 0},
         {"dof": float("nan")},
         {"dof": "1"},
@@ -227,7 +228,8 @@ def test_a_tie_or_an_error_of_a_check_leaves_no_confidence():
 
 
 @pytest.mark.parametrize(
-    "unknown", [{"prediction": np.nan}, {"novelty": np.nan}, {"undecided": 1}, {"distortion": 3.5}, {"doubled": 1}]
+    "unknown",
+    [{"prediction": np.nan}, {"novelty": np.nan}, {"undecided": 1}, {"distortion": 3.5}, {"doubled": 1}, {"doubts": 1}],
 )
 def test_what_cannot_be_known_bounds_the_confidence(unknown):
     assert 0.4 < plan_confidence(replace(SURE, **unknown)) < UNKNOWN

@@ -181,6 +181,7 @@ def test_another_camera_is_no_error_where_its_calibration_is_right(report, scene
         ("contradicts:demos", "demonstration 4 contradicts"),
         ("tasks-mixed:demos", "several tasks"),
         ("reversed:demos", "backwards in time"),
+        ("jump-0.5m:demos", "tracking was lost, or the rate is wrong"),
     ],
 )
 def test_demonstrations_that_do_not_belong_together_are_refused(demonstrations, fault, words):
@@ -200,6 +201,11 @@ def test_depth_that_is_missing_where_the_gripper_works_or_a_thing_may_be_is_told
     (hole,) = [finding for finding in found if finding.kind == "hole"]
     assert hole.severity == "warning"
     assert re.search(r"a hole, \d+ mm wide, at pixel \(\d+, \d+\)", hole.message)
+
+
+def test_demonstrations_that_would_take_days_at_their_rate_are_told(demonstrations):
+    slow = check_demonstrations(FAULTS["rate-0.001:demos"].demonstrations(demonstrations))
+    assert any("is the rate right?" in note for note in slow.notes)
 
 
 @pytest.mark.parametrize(("fault", "words"), [("depth-8-bit:scene", "8 bits"), ("grey:scene", "infrared")])

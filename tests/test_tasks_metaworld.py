@@ -11,10 +11,11 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from robust_instant_policy.cli import main
 from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.evaluation import Episode, Scene, Suite, Variant, read_results
+from robust_instant_policy.evaluation.failures import Failure
 from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.geometry import lift, project, transform_points
 from robust_instant_policy.motion.gripper_changes import state_of_opening
-from robust_instant_policy.reporting.benchmark import benchmark_figure, group_table, task_table
+from robust_instant_policy.reporting.benchmark import benchmark_figure, group_table, loss_table, task_table
 from robust_instant_policy.sanity import errors
 from robust_instant_policy.tasks import check_task, make_task
 from robust_instant_policy.tasks.metaworld.benchmark import METAWORLD
@@ -164,7 +165,8 @@ def test_tables_group_tasks_by_difficulty_beside_published_numbers():
     assert neighbours["easy (28)"] == "100.0"
     assert neighbours["very hard (5)"] == "50.0"
     assert neighbours["mean of the groups"] == "62.5"  # (100 + 3 · 50) / 4
-    assert neighbours["mean of the 50 tasks"] == "78.0"  # (28 · 100 + 22 · 50) / 50
+    assert neighbours["mean of the 50 tasks"] == "78.0 (64.8 to 87.2)"  # (28 · 100 + 22 · 50) / 50; Wilson, n = 50
+    assert "replay, neighbours: 2 scenes a task." in table.note
     published = {row[0]: row for row in table.rows}["SmolVLA (2.25B), published"]
     assert dict(zip(table.head, published, strict=True))["mean of the groups"] == "68.2"
     assert "what differs" not in table.note
@@ -174,3 +176,27 @@ def test_tables_group_tasks_by_difficulty_beside_published_numbers():
     assert by_task["stick-pull †"][1:] == ("very hard", "100", "50")
     assert by_task["stick-push"][1:] == ("very hard", "100", "50")
     assert benchmark_figure(METAWORLD, summary).axes[0].get_ylabel() == "success [%]"
+
+
+def test_failures_are_told_by_task_and_stage_for_sets_of_demonstrations_with_scenes_of_their_own():
+    sets = [Variant("gp", demo_set=number) for number in range(2)]
+    suite = Suite("metaworld", ("metaworld/push", "metaworld/reach"), tuple(sets), (1_000_000, 1_001_000))
+    moved = {"metaworld/push": 2.0, "metaworld/reach": 0.0}  # seconds: plans of reach were refused
+    rows = [
+        Episode(Scene(task, "seen", seed), one, 0, 1, False, 1.0, 1.0, moved[task], 0, None, "not done")
+        for task in suite.tasks
+        for seed, one in zip(suite.seeds, sets, strict=True)
+    ]
+    told = [("samples", 0.0), ("samples", 0.02), ("keypoints", 0.2), ("samples", 0.2)]  # 0.0: none on what moves
+    found = [
+        Failure(row.scene, row.variant, 0, stage, True, stage == "keypoints", error, False)
+        for row, (stage, error) in zip(rows, told, strict=True)
+    ]
+    table = loss_table(METAWORLD, Summary(suite, rows), found)
+    by_task = {row[0]: dict(zip(table.head, row, strict=True)) for row in table.rows}
+    push, reach = by_task["push †"], by_task["reach †"]
+    assert (push["failed"], push["keypoints"], push["plan"], push["keypoint error, mm"]) == ("2 of 2", "1", "1", "20")
+    assert (reach["refused"], reach["keypoints"], reach["plan"]) == ("2", "–", "–")
+    note = group_table(METAWORLD, Summary(suite, rows)).note
+    assert "gp: 2 scenes a task, a part of them with each of 2 sets of demonstrations." in note
+    assert loss_table(METAWORLD, Summary(suite, rows), []) is None  # nothing was examined

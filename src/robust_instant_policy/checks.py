@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 import sys
 from numbers import Integral, Real
 
@@ -69,7 +70,7 @@ def _is_number(value: object, kind: type) -> bool:
 
 
 def _got(value: object) -> str:
-    return f"got {value!r} ({type(value).__name__})"
+    return f"got {reprlib.repr(value)} ({type(value).__name__})"
 
 
 def is_trusted(confidence: float | None, least: float) -> bool:

@@ -82,6 +82,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="run everything with N sets of demonstrations, each of other scenes (default: %(default)s)",
     )
     parser.add_argument(
+        "--first-set",
+        type=natural,
+        default=0,
+        metavar="N",
+        help="number of the first of these sets (default: %(default)s)",
+    )
+    parser.add_argument(
         "--split",
         choices=tuple(SPLITS),
         default="test",
@@ -117,7 +124,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    first_demonstration_seed(options.sets - 1)  # refuses more sets than there are before anything is recorded
+    sets = range(options.first_set, options.first_set + options.sets)
+    first_demonstration_seed(sets[-1])  # refuses more sets than there are before anything is recorded
     base = Variant.of(
         method_settings(options),
         demos=options.demos,
@@ -149,7 +157,7 @@ def run(options: argparse.Namespace) -> int:
             demo_set=demo_set,
             analyses=not options.no_analysis,
         )
-        for demo_set in range(options.sets)
+        for demo_set in sets
     ]
     workers: Workers = (
         LocalWorkers(options.workers or 1) if options.ray is None else RayWorkers(options.ray, options.workers)

@@ -25,6 +25,7 @@ INPUTS_PER_QUERY = 2  # keypoint coordinates shown with each example
 NOISE_MM = 5.0  # variation of a keypoint coordinate that carries no information
 INTERPOLATED_MM = 5.0  # a step whose numbers follow from its neighbours this closely is not asked for
 LEVER_MM = 100.0  # distance at which turns are written as lengths
+ANSWER_MARGIN = 1.5  # an answer may have as many digits as this many times the largest demonstrated number
 HAND_DIM, HAND_STATE = 7, 6  # numbers of a hand: point, turn, state
 STEPS_PER_QUERY = 4  # neighbouring steps asked for together: they share the examples' inputs
 
@@ -208,7 +209,7 @@ def _question(arm: int, steps: Sequence[int], offsets: FloatArray, shown: FloatA
     if not asked:
         return None
     rows = np.stack([whole[:, step, dim] for step, dim in asked], axis=1)
-    digits = tuple(max(1, len(str(round(1.5 * largest[step, dim])))) for step, dim in asked)
+    digits = tuple(max(1, len(str(round(ANSWER_MARGIN * largest[step, dim])))) for step, dim in asked)
     seen = shown[:, steps[0], arm]
     inputs = informative_inputs(seen, rows)
     examples = tuple(_input(points, inputs) + write_row(row) + "\n" for points, row in zip(seen, rows, strict=True))

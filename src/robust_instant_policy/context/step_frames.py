@@ -18,6 +18,8 @@ from robust_instant_policy.context.ways import Ranking
 from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
+LEAST_RANGE = 0.001  # metres of a distance, or of a relative size: a smaller range that was shown counts as this one
+
 
 @dataclass(frozen=True, eq=False)
 class StepFrames:
@@ -146,7 +148,7 @@ class StepFrames:
 def _excess(shown: FloatArray, value: float) -> float:
     """By how much ``value`` lies outside of the range of the ``shown (I,)`` values, as a share of it."""
     low, high = float(shown.min()), float(shown.max())
-    return max(low - value, value - high, 0.0) / max(high - low, 1e-3)
+    return max(low - value, value - high, 0.0) / max(high - low, LEAST_RANGE)
 
 
 def hands_of(actions: FloatArray) -> FloatArray:

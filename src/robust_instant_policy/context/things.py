@@ -23,6 +23,9 @@ OUTLIER_M = 0.006  # residual at which a keypoint's influence on a fitted pose i
 SHAPE_TOLERANCE = 0.15  # of a thing's size: how far its shape may vary beside its size
 LEAST_SWING_RAD = 0.2  # a part that turns less than this shows no hinge
 LEVEL_RAD = 0.2  # usual tilt of a hinge's axis from the horizontal or the vertical; short arcs show the axis badly
+HINGE_SHARES = (1.0, 0.25, 0.5, 0.75)  # of a part's angle at which frames about its hinge stand
+FLAT_CIRCLE = 0.01  # singular values below this share of the largest: arcs too short to show their centre
+HINGE_PRIOR = 0.01  # weight of the first guess: turning about an axis and moving along it change nothing else
 LEAST_SCALED = 4  # keypoints of a thing of varying size: two define it
 LEAST_GROWTH = 0.1  # standard deviation of a thing's size, relative; one that varies less shows no size
 SIZE_EXPLAINS = 0.7  # relative spread of distances when divided by the size, below which a thing has one
@@ -244,7 +247,7 @@ def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) ->
         fits = [fit for fit in found_axes if fit is not None and fit[0] < tolerance]
         if fits:
             _, hinge, shape = min(fits, key=lambda fit: fit[0])
-            for share in (1.0, 0.25, 0.5, 0.75):
+            for share in HINGE_SHARES:
                 hinged.append(Thing("hinged", members, shape, Hinge(hinge.base, hinge.point, hinge.rotation, share)))
     return hinged
 
@@ -262,7 +265,7 @@ def _hinge(base: Thing, base_at: Located, points: FloatArray) -> tuple[float, Hi
     circles = local @ frame[:, :2]  # |p|² = 2 p·c + a constant for each point: linear in the centre c
     flat = circles - circles.mean(axis=0)
     square = (circles**2).sum(axis=-1)
-    centre = np.linalg.lstsq(2 * flat.reshape(-1, 2), (square - square.mean(axis=0)).ravel(), rcond=1e-2)[0]
+    centre = np.linalg.lstsq(2 * flat.reshape(-1, 2), (square - square.mean(axis=0)).ravel(), rcond=FLAT_CIRCLE)[0]
     guess = frame @ np.append(centre, (local @ frame[:, 2]).mean())
     if _off_axis(local, guess, frame)[0] > RIGID_SPREADS * RIGID_SPREAD_M[1]:
         return None
@@ -272,8 +275,7 @@ def _hinge(base: Thing, base_at: Located, points: FloatArray) -> tuple[float, Hi
         seen, turned, _ = _about_axis(local, guess + x[3:], rotation)
         rise = float(np.arcsin(min(abs(rotation[2, 2]), 1.0)))
         tilt = min(rise, np.pi / 2 - rise) / LEVEL_RAD if base.kind != "rigid" else 0.0
-        # The last term: turning about the axis and moving along it change nothing else.
-        return np.concatenate([((seen - turned) / OUTLIER_M).ravel(), [tilt], 0.01 * x])
+        return np.concatenate([((seen - turned) / OUTLIER_M).ravel(), [tilt], HINGE_PRIOR * x])
 
     x = least_squares(residuals, np.zeros(6), loss="soft_l1", max_nfev=20).x
     hinge = Hinge(base, guess + x[3:], frame @ Rotation.from_rotvec(x[:3]).as_matrix())

@@ -71,7 +71,8 @@ def read_depth(path: Path, unit: float) -> NDArray[np.float32]:
         raise DatasetError(f"{path} must be a depth image of 16 bits, got {image.mode}: {REPAIR}")
     steps = np.asarray(image).astype(np.float64)
     steps[steps == 0] = np.nan
-    return (steps * unit).astype(np.float32)
+    with np.errstate(over="ignore"):  # of a unit beyond any camera
+        return (steps * unit).astype(np.float32)
 
 
 def _open(path: Path) -> Image.Image:

@@ -166,7 +166,7 @@ class DatasetWriter:
             for episode in range(self.num_episodes):
                 try:
                     self._statistics = extended(self._statistics, read_statistics(self.path, episode))
-                except (KeyError, ValueError, TypeError, IndexError) as error:
+                except (KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
                     raise DatasetError(
                         f"{self.path} is damaged: the statistics of episode {episode} are not as written "
                         f"({excerpt(error)}); restore it, or choose another folder"

@@ -222,9 +222,13 @@ class Summary:
         self.variants: list[Variant] = sorted(known, key=lambda variant: ROW_METHODS.index(variant.method))
         self.tasks: list[str] = [task for task in suite.tasks if any(row.scene.task == task for row in self.rows)]
 
+    def rows_of(self, variant: Variant, task: str | None = None) -> list[Episode]:
+        """The executions of ``variant`` in ``task``, or in all."""
+        return [row for row in self._rows.get(variant, ()) if task in (None, row.scene.task)]
+
     def rate(self, variant: Variant, task: str | None = None) -> Rate | None:
         """In ``task``, or all executions together; None where there were none."""
-        rows = [row for row in self._rows.get(variant, ()) if task in (None, row.scene.task)]
+        rows = self.rows_of(variant, task)
         return Rate(tuple(_means_of_scenes(rows).values()), len(rows)) if rows else None
 
     def of_tasks(self, variant: Variant, beside: Variant | None = None) -> list[float]:
@@ -237,6 +241,12 @@ class Summary:
     def over_tasks(self, variant: Variant) -> tuple[float, float]:
         """Mean and standard deviation of the success rate over tasks."""
         return mean_and_deviation(self.of_tasks(variant))
+
+    def interval_over_tasks(self, variant: Variant) -> tuple[float, float]:
+        """95% interval of the mean of `over_tasks`, see `scene_interval`, with one trial a task and set of
+        demonstrations: scenes that share what was shown are no independent trials."""
+        clusters = {(row.scene.task, row.variant.demo_set) for row in self._rows[variant]}
+        return scene_interval(self.over_tasks(variant)[0], len(clusters))
 
     def of_sets(self, variant: Variant) -> dict[int, float]:
         """For each set of demonstrations the success rate, averaged over tasks."""

@@ -81,7 +81,7 @@ class Gate:
         for index, arm in enumerate(self._arms):
             if not (np.isfinite(joints[index]).all() and np.isfinite(fingers[index])):
                 raise UnreachableError(f"{arm.name}: a command is not a number; nothing was sent")
-            if not -1e-6 <= fingers[index] <= arm.finger_travel + 1e-6:
+            if not -ROUNDING_M <= fingers[index] <= arm.finger_travel + ROUNDING_M:
                 what = "the fingers are told to open by"
                 raise UnreachableError(exceeded(arm.name, what, fingers[index], arm.finger_travel, "m", "gripper"))
             check_joint_range(joints[index : index + 1], arm, self._rate)

@@ -29,7 +29,10 @@ from robust_instant_policy.trajectory import Trajectory
 SMOOTHING_S = 0.12  # window of the moving average over joint commands: a jump of the speed is spread over it
 MAX_SLOWDOWN = 4.0  # a motion that needs more than this is not the one that was planned
 HEADROOM = 0.95  # of speeds, for the difference between the measured joints and the first command
-ROUNDING_M = 1e-6
+RETIMING_ROUNDS, RETIMING_MARGIN = 6, 1.02  # slower by a little more than needed, until smoothing exceeds no limit
+ROUNDING_M, ROUNDING_RAD = 1e-6, 1e-6
+PEAK_SPEED = 1.875  # of a minimum-jerk motion, over its mean speed
+LEAST_MOTION_S = 0.2
 HOME_MARGIN_M = 0.05  # around the box of workspace and home, in which an arm comes and goes
 UP_M = 0.10  # of the tool, before an arm goes to its park pose the direct way would be refused
 
@@ -79,14 +82,14 @@ def retimed(motion: Motion, arms: Sequence[Arm], rate_hz: float, speed: float = 
     """
     motion = _stretched(_smoothed(motion, rate_hz), 1 / speed)
     total = 1.0
-    for _ in range(6):
+    for _ in range(RETIMING_ROUNDS):
         needed, reason = _slowdown(motion, arms, rate_hz)
         if needed <= HEADROOM:
             return motion
         total *= needed
         if total > MAX_SLOWDOWN:
             break
-        motion = _stretched(motion, 1.02 * needed / HEADROOM)
+        motion = _stretched(motion, RETIMING_MARGIN * needed / HEADROOM)
     raise UnreachableError(f"{reason}; the motion would have to be {total:.1f} times slower")
 
 
@@ -109,8 +112,8 @@ def check_joint_range(joints: FloatArray, arm: Arm, rate_hz: float) -> None:
     """Refuse ``joints (N, J)`` outside the range of the arm's joints."""
     low, high = arm.kinematics.joint_range.T
     outside = np.maximum(low - joints, joints - high)
-    if (outside > 1e-6).any():
-        step, joint = np.unravel_index(np.argmax(outside > 1e-6), outside.shape)
+    if (outside > ROUNDING_RAD).any():
+        step, joint = np.unravel_index(np.argmax(outside > ROUNDING_RAD), outside.shape)
         bound = (low if joints[step, joint] < low[joint] else high)[joint]
         what = f"joint {joint + 1} goes to"
         raise UnreachableError(exceeded(_when(arm, step, rate_hz), what, joints[step, joint], bound, "rad", "model"))
@@ -189,8 +192,8 @@ def minimum_jerk(share: FloatArray) -> FloatArray:
 def joint_motion(start: FloatArray, goal: FloatArray, fingers: FloatArray, arms: Sequence[Arm], rate_hz: float,
                  speed: float = 1.0) -> Motion:  # fmt: skip
     """Straight motion of joints ``(A, J)`` from ``start`` to ``goal`` with a minimum-jerk profile, fingers at rest."""
-    peak = 1.875  # of the speed of a minimum-jerk motion over its mean
-    seconds = max(float((peak * np.abs(goal - start).max(axis=1) / [arm.joint_speed for arm in arms]).max()), 0.2)
+    needed = PEAK_SPEED * np.abs(goal - start).max(axis=1) / [arm.joint_speed for arm in arms]
+    seconds = max(float(needed.max()), LEAST_MOTION_S)
     share = np.linspace(0.0, 1.0, max(math.ceil(seconds * rate_hz / speed), 2) + 1)[1:, None, None]
     share = minimum_jerk(share)
     joints = start + share * (goal - start)

@@ -60,6 +60,7 @@ SLIDES_M = 0.025 * np.array(
 )
 RIVAL_REACH_M = (0.02, 0.015)
 # Size.
+BOX_TURNS = np.deg2rad(np.arange(0.0, 90.0, 3.0))  # of upright boxes, of which the smallest gives an object's axes
 MIN_SHAPE_POINTS = 25  # of an object in the image; with fewer its size is not fitted
 EXTENT_PERCENTILES = (2.0, 98.0)  # of the points along an axis: where an object begins and ends
 MIN_EXTENT_M = 0.01  # an object that is flatter along an axis is not stretched along it
@@ -204,7 +205,7 @@ def fit_shape(motion: FloatArray, source: FloatArray, axes: FloatArray, goals: F
 
 def horizontal_axes(points: FloatArray) -> FloatArray:
     """Rows ``(3, 3)``: the sides of the smallest upright box around ``points (N, 3)``."""
-    turns = rotations_about_vertical(np.deg2rad(np.arange(0.0, 90.0, 3.0)))
+    turns = rotations_about_vertical(BOX_TURNS)
     extent = np.diff(np.percentile(points @ np.swapaxes(turns, 1, 2), EXTENT_PERCENTILES, axis=1), axis=0)[0]
     return turns[(extent[:, 0] * extent[:, 1]).argmin()]
 

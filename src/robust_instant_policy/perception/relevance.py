@@ -16,6 +16,7 @@ RELATED_M = 0.20  # the same for an object relative to which they move
 MIN_SPREAD_M = 0.01  # of the hand's places over demonstrations; less tells nothing of what they depend on
 CLOSED = 0.5  # gripper state
 MIN_RELEVANCE = 0.2  # of the most relevant object's, or, of the most relevant one at an event, of the greatest possible
+MIN_EXPLAINED = 0.8  # of the variance of a turning point, by what else does not matter
 STILL_M = 0.010  # by which scenery seems to move between images
 
 
@@ -24,7 +25,8 @@ def relevances(objects: Sequence[Sequence[FloatArray]], trajectories: Sequence[T
 
     Over the hand's events (`_events`) the sum of its nearness to the object or, if that is more, of the share of the
     variance of the hand's place that the object's place explains. It is 0 for an object that is neither the most
-    relevant one at an event nor of `MIN_RELEVANCE` in all.
+    relevant one at an event nor of `MIN_RELEVANCE` in all, unless it explains best where the hand turns (`_turns`):
+    that is how a held tool is moved to a thing that the hand never comes near.
     """
     scenes = zip(*objects, strict=True)
     events = [_events(points, path) for points, path in zip(scenes, trajectories, strict=True)]
@@ -32,7 +34,11 @@ def relevances(objects: Sequence[Sequence[FloatArray]], trajectories: Sequence[T
     of_events = np.array([_relevances(points, hands) for points in objects])
     total = of_events.sum(axis=1)
     most_at_an_event = ((of_events == of_events.max(axis=0)) & (of_events >= MIN_RELEVANCE)).any(axis=1)
-    return np.where(most_at_an_event | (total >= MIN_RELEVANCE * total.max()), total, 0)
+    relevant = np.where(most_at_an_event | (total >= MIN_RELEVANCE * total.max()), total, 0)
+    turns = _corresponding([_turns(path) for path in trajectories])
+    of_turns = np.array([_related(points, turns, MIN_EXPLAINED) for points in objects])
+    best = of_turns * (of_turns == of_turns.max(axis=0)) * (of_turns >= MIN_RELEVANCE)
+    return np.where(relevant > 0, relevant, best.max(axis=1))
 
 
 def hand_places(views: Sequence[View], trajectories: Sequence[Trajectory]) -> FloatArray:
@@ -83,14 +89,39 @@ def _events(points: Sequence[FloatArray], path: Trajectory) -> FloatArray:
     return np.array(places)
 
 
+def _turns(path: Trajectory) -> FloatArray:
+    """Midpoints of the fingertips ``(S, 3)``, metres, world, in each segment of constant gripper state of every arm
+    where they are farthest from the line between its ends."""
+    places = []
+    for arm in range(0, path.actions.shape[1], ACTION_DIM):
+        tips = path.actions[:, arm + 3 : arm + 9].reshape(-1, 2, 3).mean(axis=1)
+        changes = np.flatnonzero(np.diff(path.actions[:, arm + STATE_INDEX] > CLOSED)) + 1
+        for segment in np.split(tips, changes):
+            way = segment[-1] - segment[0]
+            away = segment - segment[0]
+            along = way * (away @ way / max(way @ way, MIN_SPREAD_M**2))[:, None]
+            places.append(segment[np.linalg.norm(away - along, axis=1).argmax()])
+    return np.array(places)
+
+
 def _relevances(points: Sequence[FloatArray], hands: FloatArray) -> FloatArray:
     """``(E,)`` of an object with ``points (N, 3)`` in each of I demonstrations, for the hand's ``hands (I, E, 3)``."""
-    centres = np.array([one.mean(axis=0) for one in points])
-    distances = np.array([cKDTree(one).query(at)[0] for one, at in zip(points, hands, strict=True)])
+    distances = _distances(points, hands)
     near = np.exp(-((distances / CONTACT_M) ** 2)).mean(axis=0)  # what only some demonstrations grasp matters, too
-    distance = np.median(distances, axis=0)
+    return np.maximum(near, _related(points, hands))
+
+
+def _related(points: Sequence[FloatArray], hands: FloatArray, least: float = 0.0) -> FloatArray:
+    """``(E,)``: share of the variance of ``hands (I, E, 3)`` that the object's place explains, if it is at ``least``
+    so much, less the farther they are from it."""
+    centres = np.array([one.mean(axis=0) for one in points])
     spread = hands.var(axis=0).sum(axis=-1)
     left = (hands - centres[:, None]).var(axis=0).sum(axis=-1)
     explained = np.where(spread > MIN_SPREAD_M**2, 1 - left / np.maximum(spread, MIN_SPREAD_M**2), 0)
-    related = np.clip(explained, 0, 1) * np.exp(-((distance / RELATED_M) ** 2))
-    return np.maximum(near, related)
+    distance = np.median(_distances(points, hands), axis=0)
+    return np.clip(explained, 0, 1) * (explained >= least) * np.exp(-((distance / RELATED_M) ** 2))
+
+
+def _distances(points: Sequence[FloatArray], hands: FloatArray) -> FloatArray:
+    """``(I, E)``, metres, of ``hands (I, E, 3)`` from the nearest of an object's points."""
+    return np.array([cKDTree(one).query(at)[0] for one, at in zip(points, hands, strict=True)])

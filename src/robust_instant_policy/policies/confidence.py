@@ -6,7 +6,7 @@ The features f_j are made from `Evidence` and are 0 where nothing speaks against
 to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A
 plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, do not
 predict each other, a thing has another shape than theirs, or the checks could not decide whether images and paths
-belong together, it is multiplied by `UNKNOWN`.
+belong together, or which of two things is meant, or doubt the recording, it is multiplied by `UNKNOWN`.
 """
 
 from __future__ import annotations
@@ -40,6 +40,11 @@ UNDECIDED_NOTE = (
 
 DOUBLED_NOTE = (
     f"unchecked: it is not known which of two things of one look is meant; the confidence is at most {UNKNOWN}"
+)
+
+DOUBTED_NOTE = (
+    "unchecked: gripper states, grasps or rotations seem to be recorded wrongly, as a warning says; "
+    f"the confidence is at most {UNKNOWN}"
 )
 
 DISTORTED = 3.0  # `Evidence.distortion` above which a thing is another one than was demonstrated, or found wrongly
@@ -106,6 +111,7 @@ class Evidence:
             UNKNOWN_NOTE: not (np.isfinite(self.prediction) and np.isfinite(self.novelty)),
             UNDECIDED_NOTE: self.undecided > 0,
             DOUBLED_NOTE: self.doubled > 0,
+            DOUBTED_NOTE: self.doubts > 0,
             distorted: self.distortion > DISTORTED,
             unexplained: self.unexplained > UNEXPLAINED_M,
         }

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any, get_args
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.checks import checked_positive, checked_whole
 from robust_instant_policy.context import Frames, Layout
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError, UsageError
+from robust_instant_policy.geometry import as_numbers
 from robust_instant_policy.perception import CORRESPONDENCES, PAPER_REAL, PAPER_SIMULATION, DescriptorSettings
 from robust_instant_policy.plugins import is_own
 from robust_instant_policy.policies.own_keypoints import KeypointSource
@@ -76,7 +76,7 @@ class Settings:
             checked_positive("temperature", self.temperature)
         for name, known in WORDS.items():
             word = getattr(self, name)
-            own = name == "keypoints" and (not isinstance(word, str) or is_own(word))
+            own = name == "keypoints" and (is_own(word) if isinstance(word, str) else hasattr(word, "locate"))
             if not own and word not in known:
                 raise UnknownNameError(name, word, (*known, "module:Class") if name == "keypoints" else known)
         if self.workspace is not None:
@@ -125,7 +125,7 @@ class Settings:
 
 
 def _corners(workspace: ArrayLike) -> tuple[tuple[float, ...], ...]:
-    corners = np.asarray(workspace, dtype=np.float64)
+    corners = as_numbers("workspace", workspace)
     if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
         raise InvalidValueError(f"workspace must be (2, 3), lower and upper corner in metres, got {workspace!r}")
     return tuple(tuple(map(float, corner)) for corner in corners)

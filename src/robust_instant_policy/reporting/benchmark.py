@@ -1,4 +1,5 @@
-"""Tables and figure of a benchmark of other people: by group of difficulty beside published numbers, and by task."""
+"""Tables and figure of a benchmark of other people: by group of difficulty beside published numbers, by task, and the
+failures by stage."""
 
 from __future__ import annotations
 
@@ -10,6 +11,8 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from robust_instant_policy.evaluation.episodes import Episode
+from robust_instant_policy.evaluation.failures import Failure
 from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.evaluation.variant import REPLAY, Variant, labels
 from robust_instant_policy.reporting.figures import HEIGHT_IN, PARAMETERS, WIDTH_IN, style_of, success_axis
@@ -18,12 +21,18 @@ from robust_instant_policy.tasks.benchmark import Benchmark
 from robust_instant_policy.tasks.level import PAPER
 
 TUNED = " †"  # marks tasks on which this package was tuned
+LOST = {  # column of the table of failures: the stages of the failure analysis that it counts
+    "replay fails": ("execution",),
+    "keypoints": ("keypoints",),
+    "plan": ("samples", "regression"),
+}
 PUBLISHED_GREYS = ("0.90", "0.80", "0.70", "0.60", "0.50", "0.40")
 
 
-def benchmark_tables(benchmark: Benchmark, summary: Summary) -> list[Table]:
-    """The table by groups, then that by tasks."""
-    return [group_table(benchmark, summary), task_table(benchmark, summary)]
+def benchmark_tables(benchmark: Benchmark, summary: Summary, failures: Sequence[Failure] = ()) -> list[Table]:
+    """The table by groups, that by tasks, and, where some were examined, that of ``failures`` by stage."""
+    lost = loss_table(benchmark, summary, failures)
+    return [group_table(benchmark, summary), task_table(benchmark, summary), *([lost] if lost else [])]
 
 
 def group_table(benchmark: Benchmark, summary: Summary) -> Table:
@@ -33,21 +42,33 @@ def group_table(benchmark: Benchmark, summary: Summary) -> Table:
     parts = {f"tuning ({len(benchmark.tuning)})": benchmark.tuning, f"measuring ({len(measured)})": measured}
     if not benchmark.tuning:
         parts = {}
+    sets = {variant: summary.of_sets(variant) for variant in summary.variants}
+    several = any(len(rates) > 1 for rates in sets.values())
     rows = []
     for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
         rates = [_mean(summary, variant, tasks) for tasks in groups.values()]
         known = [rate for rate in rates if rate is not None]
         cells = [_cell(summary, variant, tasks) for tasks in groups.values()]
         of_groups = f"{fmean(known):.1f}" if len(known) == len(rates) else NONE
-        others = [_cell(summary, variant, tasks) for tasks in (benchmark.tasks, *parts.values())]
-        rows.append((label, *cells, of_groups, *others))
+        low, high = summary.interval_over_tasks(variant)
+        overall = f"{_cell(summary, variant, benchmark.tasks)} ({100 * low:.1f} to {100 * high:.1f})"
+        each = [", ".join(f"{100 * rate:.1f}" for rate in sets[variant].values())] if several else []
+        others = [_cell(summary, variant, tasks) for tasks in parts.values()]
+        rows.append((label, *cells, of_groups, overall, *each, *others))
     sizes = [len(tasks) for tasks in benchmark.groups.values()]
     for name, percents in benchmark.published.items():
         weighted = float(np.average(percents, weights=sizes))
         cells = [f"{percent:.1f}" for percent in percents]
-        rows.append((f"{name}, published", *cells, f"{fmean(percents):.1f}", f"{weighted:.1f}", *(NONE for _ in parts)))
-    head = ("method", *groups, "mean of the groups", f"mean of the {sum(sizes)} tasks", *parts)
-    return Table(head, tuple(rows), f"{_conditions(summary)} {_reading(benchmark, summary)} {benchmark.protocol}")
+        blank = [NONE] * (several + len(parts))
+        rows.append((f"{name}, published", *cells, f"{fmean(percents):.1f}", f"{weighted:.1f}", *blank))
+    each_set = ["with each set"] * several
+    head = ("method", *groups, "mean of the groups", f"mean of the {sum(sizes)} tasks", *each_set, *parts)
+    interval = (
+        "In parentheses Wilson's 95% interval of the mean over the tasks, with one trial a task and set of "
+        "demonstrations."
+    )
+    note = (_conditions(summary), _extent(summary), interval, _reading(benchmark, summary), benchmark.protocol)
+    return Table(head, tuple(rows), " ".join(filter(None, note)))
 
 
 def task_table(benchmark: Benchmark, summary: Summary) -> Table:
@@ -63,13 +84,44 @@ def task_table(benchmark: Benchmark, summary: Summary) -> Table:
                 rate = summary.rate(variant, task)
                 cells.append(NONE if rate is None else f"{100 * rate.value:.0f}")
             rows.append((name, group, *cells))
-    counts = []
-    for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
-        trials = [rate.trials for task in summary.tasks if (rate := summary.rate(variant, task)) is not None]
-        counts.append(f"{label} {min(trials)}" + (f" to {max(trials)}" if max(trials) > min(trials) else ""))
-    note = f"Success in percent. {_conditions(summary)} {_reading(benchmark, summary)}"
-    note += f" Executions a task: {', '.join(counts)}."
-    return Table(("task", "group", *labels(summary.variants)), tuple(rows), note)
+    note = ("Success in percent.", _conditions(summary), _extent(summary), _reading(benchmark, summary))
+    return Table(("task", "group", *labels(summary.variants)), tuple(rows), " ".join(filter(None, note)))
+
+
+def loss_table(benchmark: Benchmark, summary: Summary, failures: Sequence[Failure]) -> Table | None:
+    """One row a task and method that failed: how many failures each stage caused; None if none was examined."""
+    known = {failure.key: failure for failure in failures}
+    rows, examined = [], False
+    for task in summary.tasks:
+        for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
+            own = [row for row in summary.rows_of(variant, task) if not row.success]
+            if variant.method == REPLAY or not own:
+                continue
+            moved = [known.get(row.key) for row in own if not _is_refused(row)]
+            found = [failure for failure in moved if failure is not None]
+            examined = examined or bool(found)
+            stages = ["keypoints" if failure.keypoint_error == 0 else failure.stage for failure in found]
+            errors = [1e3 * failure.keypoint_error for failure in found if failure.keypoint_error]
+            counts = [len(own) - len(moved), *(sum(map(stages.count, which)) for which in LOST.values())]
+            cells = [str(count or NONE) for count in (*counts, len(own) - sum(counts))]
+            off = f"{np.median(errors):.0f}" if errors else NONE
+            name = task.removeprefix(f"{benchmark.name}/") + (TUNED if task in benchmark.tuning else "")
+            rows.append((name, label, f"{len(own)} of {len(summary.rows_of(variant, task))}", *cells, off))
+    if not examined:
+        return None
+    note = (
+        "Failed executions by the stage that lost them. *Refused*: no plan could be made, or the checks before motion "
+        "refuse it. Of the others the first that holds: *replay fails*, the demonstrator's own trajectory for the "
+        "scene is no success either; *keypoints*, the method succeeds with the true ones, or none lies on anything "
+        "that moves; *plan*, it fails with the true ones, too. The last column is the median, over failures that were "
+        "examined beyond replays, of the largest error of a keypoint on an object."
+    )
+    head = ("task", "method", "failed", "refused", *LOST, "not examined", "keypoint error, mm")
+    return Table(head, tuple(rows), note)
+
+
+def _is_refused(row: Episode) -> bool:
+    return row.executed_seconds == 0
 
 
 def benchmark_figure(benchmark: Benchmark, summary: Summary) -> Figure:
@@ -120,6 +172,22 @@ def _conditions(summary: Summary) -> str:
     words += [f"descriptors: {', '.join(features)}"] if features else []
     words += [] if summary.suite.level == PAPER.name else [f"level {summary.suite.level}"]
     return f"{'; '.join(words)}." if words else ""
+
+
+def _extent(summary: Summary) -> str:
+    """How many scenes and sets of demonstrations the numbers of each method are of."""
+    told: dict[str, list[str]] = {}
+    for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
+        rates = [rate for task in summary.tasks if (rate := summary.rate(variant, task)) is not None]
+        scenes, sets = {rate.scenes for rate in rates}, len(summary.of_sets(variant))
+        count = f"{min(scenes)}" + (f" to {max(scenes)}" if len(scenes) > 1 else "")
+        words = f"{count} scene{'s' if scenes != {1} else ''} a task"
+        if sets > 1:
+            rows = summary.rows_of(variant)
+            shared = len({(row.scene, row.variant.demo_set) for row in rows}) > len({row.scene for row in rows})
+            words += f", {'all' if shared else 'a part'} of them with each of {sets} sets of demonstrations"
+        told.setdefault(words, []).append(label)
+    return "; ".join(f"{', '.join(names)}: {words}" for words, names in told.items()) + "."
 
 
 def _reading(benchmark: Benchmark, summary: Summary) -> str:

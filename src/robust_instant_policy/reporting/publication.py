@@ -7,6 +7,7 @@ from pathlib import Path
 
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.experiment import TRAINING_FOLDER, plan_file
+from robust_instant_policy.evaluation.failures import Failure
 from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.evaluation.store import read_results
 from robust_instant_policy.evaluation.suites import CHOSEN
@@ -53,7 +54,7 @@ def publish(out: Path) -> str:
         if any(row.variant.config == config for row in summary.rows)
         and (summary.suite.name != CHOSEN or not {row.key for row in summary.rows} <= of_paper)
     ]
-    sections = [_publish_suite(out, config, split, summary) for config, split, summary in shown]
+    sections = [_publish_suite(out, config, split, summary, failures) for config, split, summary in shown]
     rows = list({row.key: row for *_, summary in shown for row in summary.rows}.values())
     lost = failure_table(rows, failures)
     text = _text([table for section in sections for table in section.tables])
@@ -67,14 +68,14 @@ def publish(out: Path) -> str:
     return text
 
 
-def _publish_suite(out: Path, config: str, split: str, summary: Summary) -> Section:
+def _publish_suite(out: Path, config: str, split: str, summary: Summary, failures: Sequence[Failure]) -> Section:
     suite = summary.suite
     usual = make_level(suite.level).objects
     kinds = tuple(kind for kind, expected in ((suite.objects, usual), (suite.assets, "code")) if kind != expected)
     if (benchmark := BENCHMARKS.get(suite.name)) is None:
         figure, shown = draw(summary, _kept_plans(out, summary)), tables(summary)
     else:
-        figure, shown = benchmark_figure(benchmark, summary), benchmark_tables(benchmark, summary)
+        figure, shown = benchmark_figure(benchmark, summary), benchmark_tables(benchmark, summary, failures)
     drawing = encode(figure, "svg")
     section = Section(suite.name, suite.level, config, kinds, drawing, shown, split)
     stem = section.anchor

@@ -21,6 +21,7 @@ from robust_instant_policy.evaluation.variant import ROW_METHODS, Variant, by_de
 from robust_instant_policy.reporting.comparison import is_comparable, paper_rate
 
 NONE = "–"
+MAX_NAMED_TASKS = 10  # in a caption
 INTERVAL = "Wilson's 95% interval with one trial a scene"
 
 
@@ -167,11 +168,12 @@ def demos_table(summary: Summary) -> Table:
                 f"{_spread(summary, of_count[count])} ({100 * low:.0f} to {100 * high:.0f}, n={pooled.scenes})"
             )
         rows.append((label, *cells))
+    tasks = ", ".join(summary.tasks) if len(summary.tasks) <= MAX_NAMED_TASKS else f"{len(summary.tasks)} tasks"
     return Table(
         ("method", *(f"{count} shown" for count in counts)),
         tuple(rows),
         f"{_configuration(summary.variants)}"
-        f"Success in percent, mean ± standard deviation over {', '.join(summary.tasks)}; in parentheses "
+        f"Success in percent, mean ± standard deviation over {tasks}; in parentheses "
         f"{INTERVAL}, of all n scenes together.",
     )
 

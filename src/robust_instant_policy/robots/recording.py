@@ -22,6 +22,7 @@ from robust_instant_policy.trajectory import Trajectory
 
 APPROACH_RAD_S = 0.5  # at which a follower comes to its leader before both are coupled
 WAIT_S = 1.5  # without progress, until the person is told
+PROGRESS_RAD = 1e-4  # in a step
 COUPLED_RAD = 0.05  # of each joint between leader and follower, from which they are coupled
 TRIGGER_CLOSES, TRIGGER_OPENS = 0.4, 0.6  # opening of the trigger; between them the gripper keeps its state
 STILL_M = 0.003  # by which gripper points move at most while nothing is shown
@@ -89,7 +90,7 @@ class Following:
         if gap < COUPLED_RAD:
             self._coupled = True
             self._operator.say(self._words)
-        self._waited = self._waited + 1 if gap > self._gap - 1e-4 else 0
+        self._waited = self._waited + 1 if gap > self._gap - PROGRESS_RAD else 0
         self._gap = gap
         if self._waited == round(WAIT_S * self._station.rate_hz):
             self._operator.say("the follower cannot come nearer within its limits: move the leader towards its pose")

@@ -21,6 +21,8 @@ FARTHEST_REACH_M = 10.0  # from the world's origin
 UNITS = (("millimetres", 1000.0), ("centimetres", 100.0), ("inches", 39.37))
 SHAPE_CHANGE = 0.1  # relative difference of the gripper's triangle between demonstrations
 FASTEST_TURN_RAD_S = 2 * np.pi  # of the gripper, in most demonstrations
+FASTEST_M_S = 5.0  # of the gripper, from one step to the next
+LONGEST_S = 900.0  # of most demonstrations
 MIN_MOTION_M = 0.005  # over a demonstration
 COMMON = 0.7  # share of the demonstrations that makes a rule
 
@@ -41,8 +43,8 @@ def check_episodes(demonstrations: Sequence[Demonstration]) -> list[Finding]:
     if max(arms) > 1:
         words = "which arm is which was not checked: paths with exchanged arms look alike"
         found.append(Finding("arms", "unchecked", words))
-    found += _states(demonstrations) + _units(demonstrations) + _copies(demonstrations)
-    found += _turns(demonstrations)
+    found += _states(demonstrations) + _copies(demonstrations) + _turns(demonstrations)
+    found += _units(demonstrations) or _speeds(demonstrations)
     return found + _grasps(demonstrations) + _order_of_changes(demonstrations)
 
 
@@ -122,6 +124,27 @@ def _turns(demonstrations: Sequence[Demonstration]) -> list[Finding]:
         "wrongly, such as Euler angles in degrees taken for radians"
     )
     return [Finding("rotation", "error", words, {"turn_rad_s": usual}, "degrees read as radians")]
+
+
+def _speeds(demonstrations: Sequence[Demonstration]) -> list[Finding]:
+    found = []
+    for index, demonstration in enumerate(demonstrations):
+        positions = demonstration.trajectory.triplets[:, :, 0]
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1).max(axis=1, initial=0.0)
+        longest = float(steps.max(initial=0.0))
+        if longest * demonstration.rate_hz > FASTEST_M_S:
+            words = (
+                f"the gripper of demonstration {index} moves by {longest:.2g} m from step {int(steps.argmax())} to the "
+            )
+            advice = "next, faster than any arm: its tracking was lost, or the rate is wrong; record it again"
+            found.append(_error("speed", words + advice, speed=longest * demonstration.rate_hz))
+    lasting = float(np.median([len(one.trajectory) / one.rate_hz for one in demonstrations]))
+    if lasting > LONGEST_S:
+        words = (
+            f"demonstrations last {lasting / 60:.0f} minutes at {demonstrations[0].rate_hz:g} Hz: is the rate right?"
+        )
+        found.append(Finding("rate", "warning", words, {"seconds": lasting}))
+    return found
 
 
 def _copies(demonstrations: Sequence[Demonstration]) -> list[Finding]:

@@ -122,7 +122,7 @@ def _first_depth(folder: Folder, episode: int, key: str, unit_m: float | None) -
         raise DatasetError(
             f"{folder.root} does not say the unit of {key!r}; give depth_unit_m, metres per step, in the rig"
         )
-    depth = image.astype(np.float32) * np.float32(unit)
+    depth = as_numbers(key, image, np.float32) * np.float32(unit)
     return depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
 
 

@@ -26,7 +26,7 @@ from robust_instant_policy.datasets.importers.layouts import Columns, poses_of
 from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt, read_json
-from robust_instant_policy.geometry import invert_pose
+from robust_instant_policy.geometry import as_numbers, invert_pose
 
 MILLIMETRE = 1e-3
 # ManiSkill's Panda: the last action runs from -1 (closed) to 1 (open), and its tcp is the tool frame of `geometry`.
@@ -76,7 +76,7 @@ def _read_episode(
     return SourceEpisode(
         name=f"{path.name} ({name})",
         rgb=None if images is None else images[0],
-        depth=None if depth is None else depth[0, ..., 0].astype(np.float32) * MILLIMETRE,
+        depth=None if depth is None else as_numbers("depth", depth[0, ..., 0], np.float32) * np.float32(MILLIMETRE),
         intrinsics=intrinsics,
         camera_pose=None if extrinsics is None else invert_pose(np.vstack([extrinsics, [0, 0, 0, 1]])),
         poses=None if tcp is None else poses_of(f"{path} ({name})", tcp, XYZ_WXYZ),

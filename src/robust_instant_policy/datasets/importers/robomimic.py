@@ -26,7 +26,7 @@ from robust_instant_policy.datasets.importers.layouts import Columns, poses_of
 from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, as_numbers
 
 MAX_ARMS = 2
 ROBOSUITE = 1  # type of robosuite's environments
@@ -76,7 +76,7 @@ def _read_episode(
     return SourceEpisode(
         name=f"{path.name} ({excerpt(name)})",
         rgb=None if images is None else images[0],
-        depth=None if depth is None else depth[0].astype(np.float32).squeeze(),
+        depth=None if depth is None else as_numbers("depth", depth[0], np.float32).squeeze(),
         intrinsics=calibration.get("intrinsics"),
         camera_pose=calibration.get("extrinsics"),
         poses=np.stack(arms, axis=1) if arms else None,

@@ -139,7 +139,7 @@ class SourceEpisode:
                 self.poses @ self.tool, self.gripper.state(self.gripper_values), triangle
             )
             depth = self.depth
-            if depth.ndim < 3 and depth.size == self.rgb.shape[0] * self.rgb.shape[1]:
+            if depth.ndim < 3 <= self.rgb.ndim and depth.size == self.rgb.shape[0] * self.rgb.shape[1]:
                 depth = depth.reshape(self.rgb.shape[:2])  # it may be stored as one row of numbers
             observation = Observation(self.rgb, depth, self.intrinsics, self.camera_pose)
             return Demonstration(observation, trajectory, self.rate_hz, task, info=self.info)
