@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import subprocess
 import sys
 import time
 import urllib.request
@@ -41,6 +42,27 @@ def test_a_proxy_for_the_world_outside_is_not_asked_for_the_model_inside(monkeyp
     assert model.name == model_name("embedded")
     assert model.count_tokens("12 3") == 5
     model.close()
+
+
+CLOSED_AT_ONCE = """
+import os, sys
+os.sched_setaffinity(0, {int(sys.argv[1])})
+from robust_instant_policy.llm import connect
+for _ in range(3):
+    model = connect("embedded")
+    model.count_tokens("12 3")
+    model.close()
+"""
+
+
+def test_a_model_that_is_closed_at_once_is_closed_on_a_busy_core_too():
+    core = str(min(os.sched_getaffinity(0)))
+    busy = subprocess.Popen(["taskset", "-c", core, sys.executable, "-c", "while True: pass"])
+    try:
+        subprocess.run([sys.executable, "-c", CLOSED_AT_ONCE, core], timeout=100, check=True)
+    finally:
+        busy.kill()
+        busy.wait()
 
 
 def test_every_answer_keeps_the_grammar_and_samples_differ(embedded):

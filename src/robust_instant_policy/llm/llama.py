@@ -35,6 +35,7 @@ SHORT_SLOTS = 24  # over all cores; a plan has about ten prompts an arm
 MAX_SERVERS = 8  # more cores bring little to ten or twenty prompts
 PROGRESS_TOKENS = 128  # read between two checks of the deadline and of Ctrl-C, by each prompt
 MAX_CONTEXT_TOKENS = 32_768  # bounds the memory for models with a longer context
+REPLY_S = 30.0  # for what a server in this process answers at once, on a busy machine
 FINGERPRINT_PIECES, PIECE_BYTES = 8, 1 << 20  # of a model file, evenly spaced, for its digest
 _DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # the servers are in this process
 
@@ -113,12 +114,15 @@ class LlamaModel:
     def _get(self, address: str, body: dict[str, Any] | None = None) -> Any:
         if not self._servers:
             self._start(_short_layout(SHORT_TOKENS))
+        return self._fetch(self._servers[0], address, body)
+
+    def _fetch(self, server: Any, address: str, body: dict[str, Any] | None = None) -> Any:
         request = urllib.request.Request(
-            self._servers[0].listening_address + address,
+            server.listening_address + address,
             None if body is None else json.dumps(body).encode(),
             {"Content-Type": "application/json", "Authorization": f"Bearer {self._key}"},
         )
-        with _DIRECTLY.open(request, timeout=30) as response:
+        with _DIRECTLY.open(request, timeout=REPLY_S) as response:
             return json.load(response)
 
     def sample(self, queries: Sequence[Query], sampling: Sampling, listener: Listener = NOBODY) -> list[list[Answer]]:
@@ -212,7 +216,9 @@ class LlamaModel:
             with _signals_held():
                 for _ in range(layout.servers):
                     self._servers.append(xllamacpp.Server(self._params(xllamacpp, layout)))
-        except (RuntimeError, ValueError) as error:
+                    # Answered by the loop over tasks: a server that is closed before its loop runs is never closed.
+                    self._fetch(self._servers[-1], "/slots")
+        except (RuntimeError, ValueError, OSError) as error:
             self.close()
             raise ModelError(
                 f"{self._path} is not a readable GGUF file, or too large for this machine ({error}); download or copy "
