@@ -3,7 +3,7 @@ SHELL := /bin/bash
 RIP := .venv/bin/rip
 WORKERS := 3
 
-.PHONY: setup demo studio test lint pytest lerobot clean
+.PHONY: setup demo studio test lint lerobot clean
 
 setup:
 	@scripts/setup.sh
@@ -23,20 +23,15 @@ lint:
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
-# Linters and tests side by side. Both must pass: the tests end also where a linter fails.
+# The tests on three workers, each with one thread, and the share of lines that they run. Tests of real time wait, so three
+# keep two cores busy; with less than 12 GB of memory: make test WORKERS=2
 # A single test: make test ARGS="tests/test_demo.py -k plan"
 test: export OMP_NUM_THREADS := 1
 test: export OPENBLAS_NUM_THREADS := 1
 test: setup
-	@$(MAKE) --no-print-directory --jobs=2 lint pytest
-
-# The tests on three workers, each with one thread, and the share of lines that they run. Tests of real time wait, so three
-# keep two cores busy; with less than 12 GB of memory: make test WORKERS=2
-pytest:
-	@rm -rf .coverage && mkdir .coverage
-	env -u PYTHONDONTWRITEBYTECODE COVERAGE_FOLDER=$(CURDIR)/.coverage \
-		PYTHONPATH=$(CURDIR)/scripts/coverage$${PYTHONPATH:+:$$PYTHONPATH} .venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
-	@.venv/bin/python scripts/coverage_table.py .coverage
+	@$(MAKE) --no-print-directory lint
+	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --cov --cov-report= $(ARGS)
+	@.venv/bin/python scripts/coverage_table.py
 
 # The LeRobot plugins, in an environment of their own (6 GB): the commands of docs/lerobot.md as they stand there, and tests.
 LEROBOT := .venv-lerobot
@@ -46,4 +41,4 @@ lerobot: setup
 	.venv/bin/python scripts/lerobot_end_to_end.py --lerobot $(LEROBOT)
 
 clean:
-	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage .coverage.*

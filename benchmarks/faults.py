@@ -444,6 +444,12 @@ def no_depth_on_a_thing(o: Observation) -> Observation:
     return without_depth(o, np.array([[cols[middle], rows[middle]]]))
 
 
+def eight_bits(observation: Observation) -> Observation:
+    """Depth in steps of 8 mm of a table that is tilted by 0.3 m over the image: a flat one has a few levels anyway."""
+    tilt = np.linspace(0, 0.3, observation.depth.shape[1], dtype=np.float32)
+    return replace(observation, depth=np.rint((observation.depth + tilt) * 127) / np.float32(127))
+
+
 def twice(o: Observation) -> Observation:
     """What stands above the table a second time, where the table is free; unchanged where there is no room."""
     rows, cols = raised_pixels(o)
@@ -625,7 +631,7 @@ def _faults() -> dict[str, Fault]:
         add(f"first-{count}:demos", (), demonstrations=first(count))
     add("neighbouring-4:demos", ("outside",), demonstrations=neighbouring(4))
     add("pitch-1deg:scene", ("said to be",), scene=lambda o, _: turned_camera(o, 1.0))
-    add("depth-8-bit:scene", ("8 bits",), scene=lambda o, _: replace(o, depth=np.rint(o.depth * 127) / np.float32(127)))
+    add("depth-8-bit:scene", ("8 bits",), scene=lambda o, _: eight_bits(o))
     add("grey:scene", ("infrared",), scene=lambda o, _: replace(o, rgb=o.rgb[..., [1, 1, 1]]))
     add("half-hidden:scene", ("recognised",), scene=lambda o, _: half_hidden(o))
     add("no-depth-at-grasps:demos", ("depth",), demonstrations=lambda ds: list(map(no_depth_at_grasps, ds)))

@@ -1,33 +1,26 @@
-"""Print which share of the lines of each room of the package the last tests ran.
-
-coverage_table.py FOLDER      the files that `coverage/sitecustomize.py` left there
-"""
+"""Print which share of the lines of each room of the package the last tests ran, from coverage's data file."""
 
 from __future__ import annotations
 
-import json
-import sys
-from collections import Counter, defaultdict
+from collections import Counter
 from pathlib import Path
 
-from slipcover import Slipcover
+import coverage
 
-PACKAGE = Path(__file__).resolve().parents[1] / "src" / "robust_instant_policy"
+PACKAGE = Path(__file__).parents[1] / "src" / "robust_instant_policy"
 
 
-def main(folder: Path) -> None:
-    run: defaultdict[Path, set[int]] = defaultdict(set)
-    for file in folder.glob("*.json"):
-        for name, executed in json.loads(file.read_text()).items():
-            run[Path(name).resolve()].update(executed)
+def main() -> None:
+    measured = coverage.Coverage()
+    measured.load()
     lines: Counter[str] = Counter()
     missed: Counter[str] = Counter()
     for path in sorted(PACKAGE.rglob("*.py")):
-        statements = set(Slipcover.lines_from_code(compile(path.read_bytes(), str(path), "exec")))
+        _, statements, _, missing, _ = measured.analysis2(str(path))
         inside = path.relative_to(PACKAGE)
         room = f"{inside.parts[0]}/" if len(inside.parts) > 1 else "(top)"
         lines[room] += len(statements)
-        missed[room] += len(statements - run[path])
+        missed[room] += len(missing)
     print(f"{'room':<14} {'lines':>6} {'missed':>6} {'run':>6}")
     for room in sorted(lines):
         print(_row(room, lines[room], missed[room]))
@@ -39,4 +32,4 @@ def _row(name: str, lines: int, missed: int) -> str:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main()

@@ -272,5 +272,5 @@ def test_keypoints_of_ones_own_that_break_their_contract_are_refused(found, erro
     shown = [task.demonstrate(seed).demonstration for seed in range(3)]
     with pytest.raises(error, match=told):
         Neighbours(keypoints=Given(found)).fit(shown)
-    with pytest.raises(UsageError, match="have no locate"):
+    with pytest.raises(UsageError, match="unknown keypoints 3"):
         Neighbours(keypoints=3).fit(shown)

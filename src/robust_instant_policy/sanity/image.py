@@ -13,6 +13,7 @@ from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.view import View
 
 MIN_READINGS = 0.05  # share of the pixels that must have a steady depth
+FEWEST_LEVELS = 16  # of depth that was stored coarsely; fewer are flat surfaces seen from straight above
 COARSE = 0.005  # of the median depth: a greater smallest difference between readings comes from no camera
 UNIFORM = 3.0  # of 255; a colour image that varies less shows nothing
 SQUARE_PIXELS = 0.1  # relative difference of fx and fy that no camera has
@@ -53,8 +54,10 @@ def check_image(view: View) -> list[Finding]:
     if (median := float(np.median(raw))) > MILLIMETRES_ABOVE:
         words = f"depth has a median of {median:.0f}: it is in millimetres, and read as such; store metres"
         found.append(Finding("depth unit", "warning", words, {"median": median}, "millimetres"))
-    if (step := float(np.diff(np.unique(raw)).min(initial=np.inf))) > COARSE * median and np.isfinite(step):
-        words = f"depth has {len(np.unique(raw))} levels only, at least {step:.3g} apart: was it stored in 8 bits?"
+    levels = np.unique(raw)
+    step = float(np.diff(levels).min(initial=np.inf))
+    if len(levels) >= FEWEST_LEVELS and step > COARSE * median:
+        words = f"depth has {len(levels)} levels only, at least {step:.3g} apart: was it stored in 8 bits?"
         found.append(Finding("depth levels", "warning", words, {"step": step}, "8 bits"))
     if (spread := float(view.rgb.std())) < UNIFORM:
         words = (
