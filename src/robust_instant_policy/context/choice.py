@@ -307,8 +307,9 @@ def _best(errors: Errors) -> IntArray:
 def _with_weighted_points(
     candidates: Candidates, errors: Errors, hands: FloatArray, second: NDArray[np.bool_] | None
 ) -> Candidates:
-    """``candidates`` with the shares of those origins by axis that suit some step best, as fitted to the best of them:
-    shares times points in the ends are not linear in both.
+    """``candidates``, where origins by axis that suit some step best have shares: those fitted to the best such step.
+
+    The place is not linear in shares and points together, so that points are fitted for given shares.
     """
     picks = _best(errors)
     frames = _fitted(candidates, errors, hands, second, picks)

@@ -175,7 +175,7 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> tupl
 
 
 def _one_differs(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> bool:
-    """Whether one way explains all demonstrations but a single one, which is rather an error than a way."""
+    """Whether one way explains all demonstrations but a single one, which is then taken for an error, not for a way."""
     every = np.arange(len(hands))
     rests = (every[every != demo] for demo in every)
     return any(

@@ -192,10 +192,9 @@ class KeypointExtractor:
         registrations = register_all(models, view)
         located = self._locate(view, registrations)
         notes, doubled = list(located.notes), []
-        for number, (first, second) in enumerate(
-            zip(registrations, find_again(models, registrations, view), strict=True)
-        ):
-            if len(self._places[number]) and second.score > SAME_LOOK * first.score:
+        chosen = [number for number, places in enumerate(self._places) if len(places)]
+        for number, second in find_again(models, registrations, view, chosen).items():
+            if second.score > SAME_LOOK * registrations[number].score:
                 doubled.append(number)
                 place = transform_points(second.motion, models[number].points.mean(axis=0))
                 col, row = project(place[None], view.observation.intrinsics, view.observation.camera_pose)[0]

@@ -160,20 +160,22 @@ def register(
     return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index, refined.motions[1:])
 
 
-def find_again(models: Sequence[Model], found: Sequence[Registration], view: View) -> list[Registration]:
-    """Each object in what no object explains of ``view``: a second thing of its look has about the score of the first.
+def find_again(
+    models: Sequence[Model], found: Sequence[Registration], view: View, which: Iterable[int]
+) -> dict[int, Registration]:
+    """Objects ``which`` in what no object explains of ``view``: a second thing of its look has about the score of the
+    first.
 
     Parts are not looked for, nor objects with more points than are left.
     """
     taken = explained(models, found, range(len(models)))
     left = int((~within(view.target[:, :3], taken, CLAIM_M)).sum()) if len(taken) else len(view.target)
-    again = []
-    for model, one in zip(models, found, strict=True):
-        size = len(model.templates[one.template].surface)
-        if model.parent >= 0 or left < max(MIN_TARGET_POINTS, LEFT_OF_TWIN * size):
-            again.append(NOT_FOUND)
-        else:
-            again.append(register(model.templates, view, taken, colour_cap=model.colour_cap))
+    again = {}
+    for number in which:
+        model = models[number]
+        size = len(model.templates[found[number].template].surface)
+        if model.parent < 0 and left >= max(MIN_TARGET_POINTS, LEFT_OF_TWIN * size):
+            again[number] = register(model.templates, view, taken, colour_cap=model.colour_cap)
     return again
 
 

@@ -62,7 +62,8 @@ LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one
 NOISE_M = 0.02  # variation of a coordinate below which it says nothing about a scene
 RIGID_M = 0.010  # variation of the distance of two keypoints below which they belong to one rigid thing
 DISTANCE_M = 0.003  # with which a distance between keypoints is measured
-RECORDING = {"gripper state", "grasp", "rotation"}  # kinds of findings
+# Kinds of findings: that doubt the recording, and that leave open whether images and paths belong together.
+RECORDING = {"gripper state", "grasp", "rotation"}
 UNDECIDED = {"contact", "hole"}
 MIN_SCENES = 3  # below which nothing is known of their variation
 

@@ -88,7 +88,7 @@ def _displaced(view: View, reference: Observation) -> float:
 
 
 def _name_calibration(old: Observation, new: Observation, change: CameraChange) -> str:
-    for hypothesis in OF_POSE if not change.pose_within_calibration else ():
+    for hypothesis in () if change.pose_within_calibration else OF_POSE:
         if camera_change(old, hypothesis.correct(new)).pose_within_calibration:
             return f"{hypothesis.cause} is the demonstrations'; {hypothesis.remedy}"
     if not change.intrinsics_within_calibration:

@@ -88,10 +88,10 @@ def keypoint_picture(rgb: np.ndarray, context: Context | None = None, scene: Loc
     if context is not None and scene is not None:
         pixels = scene.located.pixels + 0.5
         part = _around(pixels, width, height)
-        radius = KEYPOINT_PX * part[2] / 256
+        scale = part[2] / 256
         for index, pixel in enumerate(pixels):
             told, colour = _known(context, scene, index)
-            marks.append((pixel, radius, colour, told))
+            marks.append((pixel, KEYPOINT_PX * scale, scale, colour, told))
     return _html("keypoint_picture", data, width, height, part.round(1), marks)
 
 
