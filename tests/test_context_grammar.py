@@ -18,15 +18,15 @@ from robust_instant_policy.trajectory import Trajectory
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-from relation_families import FAMILIES
+from relation_families import FAMILIES, Drawn, Family, at, carry, down
 from relations import key_error
 
 WITHIN_M = 0.015
 
 
-def shown(family: str, count: int = 10, noise: float = 0.002, number: int = 7):
+def shown(family: str | Family, count: int = 10, noise: float = 0.002, number: int = 7):
     """Set ``number`` of a family's demonstrations: keypoints, trajectories, and what draws more scenes."""
-    draw = FAMILIES[family].scenes("tune", number, noise)
+    draw = (FAMILIES[family] if isinstance(family, str) else family).scenes("tune", number, noise)
     scenes = [draw(index) for index in range(count)]
     return np.stack([scene.keypoints for scene in scenes]), [scene.trajectory for scene in scenes], draw
 
@@ -83,6 +83,34 @@ def test_demonstrations_that_do_different_things_are_told_apart(family, number):
 def test_along_each_axis_the_origin_is_that_of_one_thing_with_the_point_in_it(number):
     keypoints, trajectories, draw = shown("row", number=number)
     assert (errors(write_prompt(keypoints, trajectories), draw) < WITHIN_M).all()
+
+
+def by_axis(grasp, release) -> Family:
+    """Grasp and release at places ``(x, y)`` that follow from those of a point in B and of one in C."""
+
+    def draw(kit, layout, hand):
+        a, b, c = layout.things(3)
+        things = [at(pose, shape[:size]) for pose, shape, size in zip((a, b, c), kit.shapes, (4, 3, 3), strict=True)]
+        of_b, of_c = b @ [0.04, 0.03, 0, 1], c @ [-0.03, 0.04, 0, 1]
+        return Drawn(tuple(things), carry(*(hand(down(place(of_b, of_c), 0.04, 0.0)) for place in (grasp, release))))
+
+    return Family("by axis", "", draw)
+
+
+@pytest.mark.parametrize(
+    ("grasp", "release"),
+    [
+        (lambda b, c: (b[0], b[1]), lambda b, c: (b[0] + 1.5 * (c[0] - b[0]), c[1])),
+        (lambda b, c: (b[0], c[1]), lambda b, c: (c[0], b[1])),
+    ],
+    ids=["beyond a thing", "two kinds"],
+)
+def test_places_by_axis_may_lie_beyond_a_thing_and_differ_between_grasp_and_release(grasp, release):
+    right = []
+    for number in range(3):
+        keypoints, trajectories, draw = shown(by_axis(grasp, release), number=number)
+        right += list(errors(write_prompt(keypoints, trajectories), draw) < WITHIN_M)
+    assert np.mean(right) > 0.8
 
 
 @pytest.mark.parametrize("number", [0, 3])

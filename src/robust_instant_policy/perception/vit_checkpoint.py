@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,19 +86,24 @@ def _download(name: str) -> Path:
 
 
 def _checked(folder: Path) -> Path:
-    """The ``folder`` of a snapshot in the hub's cache, which names the content of large files by their SHA-256.
+    """The ``folder`` of a snapshot in the hub's cache, where links name the content of large files by its SHA-256.
 
-    Raises `ModelError` where the content is another, or where other users could exchange it.
+    A copy without links names none, and is not compared. Raises `ModelError` where the content is another, or where
+    other users could exchange it.
     """
+    model = folder.parents[1]
     for file in folder.iterdir():
-        content = file.resolve()
-        if any(others_can_write(path, in_own_group=False) for path in (folder, content.parent, content)):
-            raise ModelError(
-                f"other users can write to {content}; run chmod -R go-w on {folder.parents[1]}, or name a folder of "
-                "your own in HF_HOME"
-            )
+        content = Path(os.path.realpath(file))
+        if not content.is_file():  # a link that leads nowhere: what is needed is missed where it is loaded
+            continue
+        for path in {model, folder.parent, folder, content.parent, content}:
+            if others_can_write(path, in_own_group=False):
+                raise ModelError(
+                    f"other users can write to {path}; run chmod -R go-w on {model} if it is yours, or name a folder "
+                    "of your own in HF_HOME"
+                )
         if SHA256.fullmatch(content.name) and sha256(content) != content.name:
-            raise ModelError(f"{file} has another SHA-256 than the hub gave for it; remove {folder.parents[1]}")
+            raise ModelError(f"{file} has another SHA-256 than the hub gave for it; remove {model}")
     return folder
 
 

@@ -127,17 +127,20 @@ def _turns(demonstrations: Sequence[Demonstration]) -> list[Finding]:
 
 
 def _speeds(demonstrations: Sequence[Demonstration]) -> list[Finding]:
-    found = []
+    found, fast = [], {}
     for index, demonstration in enumerate(demonstrations):
         positions = demonstration.trajectory.triplets[:, :, 0]
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1).max(axis=1, initial=0.0)
-        longest = float(steps.max(initial=0.0))
-        if longest * demonstration.rate_hz > FASTEST_M_S:
-            words = (
-                f"the gripper of demonstration {index} moves by {longest:.2g} m from step {int(steps.argmax())} to the "
-            )
-            advice = "next, faster than any arm: its tracking was lost, or the rate is wrong; record it again"
-            found.append(_error("speed", words + advice, speed=longest * demonstration.rate_hz))
+        if steps.max(initial=0.0) * demonstration.rate_hz > FASTEST_M_S:
+            fast[index] = steps
+    if fast:
+        index, steps = next(iter(fast.items()))
+        others = f" (and of {len(fast) - 1} others)" if len(fast) > 1 else ""
+        longest, step = float(steps.max()), int(steps.argmax())
+        words = f"the gripper of demonstration {index}{others} moves by {longest:.2g} m from step {step} to the next"
+        advice = "faster than any arm: its tracking was lost, or the rate is wrong; record it again"
+        speed = longest * demonstrations[index].rate_hz
+        found.append(_error("speed", f"{words}, {advice}", speed=speed))
     lasting = float(np.median([len(one.trajectory) / one.rate_hz for one in demonstrations]))
     if lasting > LONGEST_S:
         words = (

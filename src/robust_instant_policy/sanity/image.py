@@ -16,6 +16,7 @@ MIN_READINGS = 0.05  # share of the pixels that must have a steady depth
 FEWEST_LEVELS = 16  # of depth that was stored coarsely; fewer are flat surfaces seen from straight above
 COARSE = 0.005  # of the median depth: a greater smallest difference between readings comes from no camera
 UNIFORM = 3.0  # of 255; a colour image that varies less shows nothing
+GREY = 2  # of 255: largest difference of the channels in a grey image with noise
 SQUARE_PIXELS = 0.1  # relative difference of fx and fy that no camera has
 CENTRED = 0.2  # of the image's size that the principal point may lie from its middle
 BAND_M, BAND_ON_TABLE, BAND_ROWS = 0.03, 0.02, 3  # height off the table, share of a row still on it, rows of the grid
@@ -64,7 +65,7 @@ def check_image(view: View) -> list[Finding]:
             f"the colour image is all the same (deviation {spread:.1f} of 255): is the lens covered, or the stream off?"
         )
         found.append(Finding("colour", "error", words, {"deviation": spread}, "black image"))
-    elif (observation.rgb == observation.rgb[..., :1]).all():
+    elif np.ptp(observation.rgb, axis=-1).max() <= GREY:
         words = (
             "the colour image has shades of grey only: is it the infrared stream? things of other colours look alike"
         )
