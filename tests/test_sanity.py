@@ -77,6 +77,30 @@ def test_the_noise_of_a_depth_camera_is_no_error(demonstrations, scene):
     assert not errors(report.check_observation(noise.photograph(scene, 99)))
 
 
+def with_images(demonstrations, change):
+    return [replace(d, observation=change(d.observation)) for d in demonstrations]
+
+
+def test_depth_that_is_displaced_against_colour_in_demonstrations_is_told(demonstrations):
+    def upward(o):
+        return replace(o, depth=np.roll(o.depth, -5, axis=0))
+
+    with pytest.raises(GeometryError, match=r"in the demonstrations depth is displaced by \+0, -5 pixels"):
+        check_demonstrations(with_images(demonstrations[:3], upward)).raise_if_wrong()
+    one = [*with_images(demonstrations[:1], upward), *demonstrations[1:4]]
+    (found,) = [f for f in check_demonstrations(one).findings if f.kind == "registration"]
+    assert "in demonstration 0 depth is displaced by +0, -5 pixels" in found.message
+
+
+@pytest.mark.parametrize("weights", [(1 / 3, 1 / 3, 1 / 3), (0, 1, 0)], ids=["mean", "green"])
+def test_monochrome_images_in_which_objects_look_like_the_table_are_no_error(demonstrations, scene, weights):
+    def grey(o):
+        return replace(o, rgb=np.repeat((o.rgb @ np.array(weights)).astype(np.uint8)[..., None], 3, axis=-1))
+
+    report = check_demonstrations(with_images(demonstrations, grey))
+    assert not errors((*report.findings, *report.check_observation(grey(scene))))
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
@@ -146,6 +170,7 @@ def test_quaternions_read_in_the_wrong_order_are_named(demonstrations):
         ("black:scene", "colour"),
         ("bgr:scene", "red and blue are exchanged"),
         ("depth-other-lens:scene", "another lens"),
+        ("depth-6px:scene", r"depth is displaced by \+6, \+0 pixels \(1\d mm\)"),
         ("cropped-3%:scene", "one was cropped"),
         ("fx-half:scene", r"displaces what it shows by \d+ mm: intrinsics"),
         ("pitch-1deg:scene", r"displaces what it shows by 2\d mm: the camera pose is wrong"),

@@ -107,6 +107,7 @@ def make_plan(
         undecided=undecided(findings),
         doubled=len(scene.located.doubled),
         unexplained=worst,
+        recognition=scene.recognition,
     )
     unknown = evidence.unknown_notes if judged else ()
     beside = (evidence.displacement_note,) if evidence.features()["displacement"] else ()
