@@ -280,6 +280,38 @@ def test_grasps_beside_or_above_what_the_image_shows_are_doubted():
     assert "above or beside a surface" in doubts((0, 0, 0.04))[0]
 
 
+def test_a_path_that_reaches_as_low_as_the_others_into_a_hole_contradicts_nothing():
+    def lowered(shown, hole):
+        """Into a hole around the block, whose middle the image shows ``hole`` metres beside it."""
+        x, y = shown.trajectory.triplets[30, 0, 1:, :2].mean(axis=0)
+        rows, cols = np.mgrid[:200, :200] * 0.6 / 300 - 99.5 * 0.6 / 300
+        inside = (np.abs(cols - x) < 0.09) & (np.abs(-rows - y - hole) < 0.09) & (shown.observation.depth > 0.59)
+        depth = np.where(inside, np.float32(0.7), shown.observation.depth)
+        actions = shown.trajectory.actions.copy()
+        actions[:, [2, 5, 8]] -= 0.05 * np.clip((0.15 - actions[:, [5]]) / 0.13, 0, 1)
+        trajectory = Trajectory(actions, shown.trajectory.times)
+        return replace(shown, observation=replace(shown.observation, depth=depth), trajectory=trajectory)
+
+    shown = [lowered(one, 0.14 if index == 3 else 0.0) for index, one in enumerate(grasps(count=5))]
+    assert check_demonstrations(shown).findings == ()
+
+
+def test_clutter_around_the_gripper_is_not_called_the_wrong_image():
+    rng = np.random.default_rng(3)
+
+    def cluttered(o):
+        rgb, depth = o.rgb.copy(), o.depth.copy()
+        for row, col in rng.integers(0, 180, (30, 2)):
+            area = slice(row, row + 14), slice(col, col + 14)
+            free = (depth[area] > 0.59)[..., None]
+            rgb[area] = np.where(free, rng.integers(0, 255, 3, dtype=np.uint8), rgb[area])
+            depth[area] = np.where(free[..., 0], np.float32(0.54), depth[area])
+        return replace(o, rgb=rgb, depth=depth)
+
+    found = errors(check_demonstrations(with_images(grasps(), cluttered)).findings)
+    assert not any("other" in finding.cause for finding in found)
+
+
 def test_a_plan_beside_the_demonstrated_place_of_a_thing_is_measured():
     demonstrations = grasps(count=9)
     new, shown = demonstrations[0], demonstrations[1:]

@@ -215,8 +215,8 @@ class Endpoint:
 
     def broken(self, failure: UnavailableError) -> ModelError:
         return ModelError(
-            f"{self.name} at {self.url} failed {MAX_BROKEN} times and answered nothing: {failure}; is it the address of "
-            "the API, and what does the server's log say?"
+            f"{self.name} at {self.url} failed {MAX_BROKEN} times and answered nothing: {failure}; is it the address "
+            "of the API, and what does the server's log say?"
         )
 
     def _refuse_truncated(self, query: Query, read: int) -> None:

@@ -23,8 +23,9 @@ class Contact:
     ``path`` is the smallest gap over the path between the fingers and a raised surface (0: it passes through what
     the image shows there); ``grasps (G,)`` the gaps where grippers close; ``lowest`` the smallest height of a
     fingertip above the table, ``lowest_gripper_point`` that of a gripper point, where the table is seen: elsewhere
-    there may be a hole, and ``least_height`` that of both above its plane, hole or not; ``buried`` the largest depth of a gripper point behind a raised surface that also lies above
-    it: what is only behind one may be free, if the camera looks from the side.
+    there may be a hole; ``least_height`` that of both above the table's plane, hole or not; ``buried`` the largest
+    depth of a gripper point behind a raised surface that also lies above it: what is only behind one may be free, if
+    the camera looks from the side.
     """
 
     path: float

@@ -73,7 +73,7 @@ def depth_shift(strength: FloatArray) -> Shift:
 
 
 def is_displaced(strength: FloatArray, usual: Shift) -> bool:
-    """Whether the peak of an `edge_strength` stands out, lies clearly beside ``usual``, and much of it is lost there."""
+    """Whether the peak of an `edge_strength` stands out and lies clearly beside ``usual``, where much of it is lost."""
     col, row = depth_shift(strength)
     beside = np.hypot(col - usual[0], row - usual[1]) > ALIGNED_PX
     inside = max(abs(col), abs(row)) < REACH_PX  # else the peak may lie beyond
