@@ -24,7 +24,7 @@ from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
     "constant": 3.85, "distortion": 1.66, "prediction": 1.88, "novelty": 1.08, "displacement": 1.34,
-    "precision": 1.03, "frames": 2.0, "doubts": 1.0, "warnings": 1.48,
+    "precision": 1.03, "frames": 1.35, "doubts": 1.0, "warnings": 1.48,
 }  # fmt: skip
 UNKNOWN = 0.5  # factor, and so the most that is claimed, where the demonstrations cannot tell
 
