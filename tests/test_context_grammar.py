@@ -61,6 +61,12 @@ def test_a_relation_is_inferred_carried_over_and_told_in_words(family, words):
     assert prompt.ways == (prompt,)
 
 
+def test_things_of_any_size_are_found_where_two_other_keypoints_were_found_in_one_place_once():
+    keypoints, trajectories, _ = shown("along")
+    keypoints[3, 9] = keypoints[3, 8]
+    assert any("of any size" in str(frame) for frame in write_prompt(keypoints, trajectories).frames.used)
+
+
 @pytest.mark.parametrize(
     ("family", "number"),
     [
@@ -192,6 +198,25 @@ def test_a_plan_is_doubted_where_it_was_not_found_what_demonstrations_have_in_co
     assert sure.confidence > 0.9
     assert doubted.confidence <= UNKNOWN
     assert any("what they have in common there was not found" in note for note in doubted.notes)
+
+
+@pytest.mark.parametrize("number", [0, 2, 4])
+def test_a_plan_is_doubted_where_frames_only_fit_the_demonstrations_that_they_are_fitted_to(number):
+    def draw(kit, layout, hand):
+        a, b, c = layout.things(3)
+        things = [at(pose, shape[:size]) for pose, shape, size in zip((a, b, c), kit.shapes, (4, 3, 3), strict=True)]
+        of_b, of_c = np.linalg.inv(a) @ b, np.linalg.inv(a) @ c
+        release = down((a @ [of_b[0, 3], of_c[1, 3], 0, 1])[:2], 0.04, 0.0)  # x of B and y of C, in the axes of A
+        return Drawn(tuple(things), carry(hand(a @ kit.grasps[0]), hand(release)))
+
+    keypoints, trajectories, draw = shown(Family("not in the grammar", "", draw), number=number)
+    policy = Neighbours()
+    policy.fit_context(context_of_keypoints(keypoints, trajectories, policy.settings))
+    for index in range(1000, 1004):
+        scene = draw(index, exact=True)
+        plan = policy.plan_scene(scene_of_keypoints(scene.keypoints))
+        assert key_error(plan.trajectory, scene.path) > WITHIN_M
+        assert plan.confidence < 0.9
 
 
 def test_each_way_shows_a_model_its_own_demonstrations():

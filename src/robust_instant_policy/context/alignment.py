@@ -109,7 +109,7 @@ def _synchronised(segments: Sequence[FloatArray], length: int) -> FloatArray:
         paths = np.stack([_tips(own) for own in even])
         warped = paths
         for _ in range(WARPING_ROUNDS):
-            at = [_warped_times(*pair) for pair in zip(_typical(warped), paths, strict=True)]
+            at = _warped_times(_typical(warped), paths)
             warped = np.stack([_at(own, shares) for own, shares in zip(paths, at, strict=True)])
         return np.stack([_at(own, shares) for own, shares in zip(even, at, strict=True)])
     return np.stack([_at(own, at) for own, at in zip(segments, times, strict=True)])
@@ -134,26 +134,31 @@ def _typical(paths: FloatArray) -> FloatArray:
     return first + constant + share[:, None] * way
 
 
-def _warped_times(path: FloatArray, other: FloatArray) -> FloatArray:
-    """Steps ``(n,)`` of ``other (m, D)`` that correspond to those of ``path (n, D)``, metres: dynamic time warping
-    (Sakoe and Chiba 1978), with a cost where one waits for the other."""
-    distance = np.linalg.norm(path[:, None] - other, axis=-1)
-    n, m = distance.shape
-    total = np.full((n + 1, m + 1), np.inf)
+def _warped_times(paths: FloatArray, others: FloatArray) -> FloatArray:
+    """For each pair, the steps ``(I, n)`` of ``others (I, m, D)`` that correspond to those of ``paths (I, n, D)``,
+    metres: dynamic time warping (Sakoe and Chiba 1978), with a cost where one waits for the other."""
+    distance = np.linalg.norm(paths[:, :, None] - others[:, None], axis=-1)
+    count, n, m = distance.shape
+    total = np.full((n + 1, m + 1, count), np.inf)
     total[0, 0] = 0.0
     for i in range(n):
         for j in range(m):
-            waits = min(total[i, j + 1], total[i + 1, j]) + WAITING_M
-            total[i + 1, j + 1] = distance[i, j] + min(total[i, j], waits)
-    matched: list[list[int]] = [[] for _ in range(n)]
-    i, j = n, m
+            waits = np.minimum(total[i, j + 1], total[i + 1, j]) + WAITING_M
+            total[i + 1, j + 1] = distance[:, i, j] + np.minimum(total[i, j], waits)
+    times = np.stack([_matched(total[..., pair]) for pair in range(count)])
+    times[:, 0], times[:, -1] = 0.0, m - 1.0
+    return times
+
+
+def _matched(total: FloatArray) -> FloatArray:
+    """For each of n steps the mean ``(n,)`` of those that are matched with it, from the costs ``(n + 1, m + 1)``."""
+    i, j = total.shape[0] - 1, total.shape[1] - 1
+    matched: list[list[int]] = [[] for _ in range(i)]
     while i and j:
         matched[i - 1].append(j - 1)
         before = (total[i - 1, j - 1], total[i - 1, j] + WAITING_M, total[i, j - 1] + WAITING_M)
         i, j = ((i - 1, j - 1), (i - 1, j), (i, j - 1))[int(np.argmin(before))]
-    times = np.array([float(np.mean(own)) for own in matched])
-    times[[0, -1]] = 0.0, m - 1.0
-    return times
+    return np.array([float(np.mean(own)) for own in matched])
 
 
 def _at(actions: FloatArray, times: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from robust_instant_policy.context.choice import choose_frames
 from robust_instant_policy.context.codec import MM
 from robust_instant_policy.context.frames import WORLD_FRAME, Frame
 from robust_instant_policy.context.joins import joined, shown_jumps
-from robust_instant_policy.context.things import WORLD, Thing, locate
+from robust_instant_policy.context.things import DEMOS_TO_TELL_THINGS, WORLD, Thing, locate
 from robust_instant_policy.context.ways import Ranking
 from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
@@ -27,12 +27,15 @@ class StepFrames:
 
     The numbers of a step are, for each arm: the point between the fingertips, then the gripper point and the first
     fingertip relative to it (millimetres, in the step's frame), and the gripper state. ``jumps`` are those of each arm
-    that were demonstrated (`shown_jumps`); none are needed where no frame changes.
+    that were demonstrated (`shown_jumps`); none are needed where no frame changes. ``error``, metres, is that with
+    which frames that are fitted to the other demonstrations predict one at the gripper change that they explain worst;
+    NaN for too few demonstrations, or without gripper changes.
     """
 
     arms: tuple[tuple[Frame, ...], ...]
     ranking: Ranking | None = None
     jumps: tuple[FloatArray, ...] = ()
+    error: float = float("nan")
 
     @classmethod
     def world(cls, num_steps: int, num_arms: int) -> StepFrames:
@@ -54,7 +57,9 @@ class StepFrames:
         scene, hands = locate([WORLD, *things], keypoints), hands_of(actions)
         arms = [hands[:, :, arm] for arm in range(hands.shape[2])]
         frames = tuple(tuple(choose_frames(things, scene, own, key_steps, second)) for own in arms)
-        return cls(frames, ranking, tuple(map(shown_jumps, arms)))
+        between = list(key_steps)[1:-1] if len(hands) >= DEMOS_TO_TELL_THINGS else []
+        error = max((own[step].error for own in frames for step in between), default=float("nan"))
+        return cls(frames, ranking, tuple(map(shown_jumps, arms)), error)
 
     @property
     def num_arms(self) -> int:

@@ -207,11 +207,12 @@ def _scaled(keypoints: FloatArray, tolerance: float) -> list[Thing]:
         z = _complex(keypoints[:, loose])
         apart = z[:, None, :] - z[:, :, None]  # from j to k
         length = np.abs(apart).mean(axis=0)
-        relative = (z[:, None, None, :] - z[:, :, None, None]) / (apart + np.eye(len(loose)))[..., None]
+        coincide = apart == 0  # k is j, or both were found in one place
+        relative = (z[:, None, None, :] - z[:, :, None, None]) / np.where(coincide, 1.0, apart)[..., None]
         scatter = np.hypot(spread(relative.real), spread(relative.imag)) * length[..., None]  # (j, k, member)
         near = np.minimum(length[:, None], length[None])  # of a member to j or k
         fits = scatter < np.maximum(SHAPE_TOLERANCE * near, tolerance)
-        fits[np.eye(len(loose), dtype=bool)] = False
+        fits[coincide.any(axis=0)] = False
         count = fits.sum(axis=-1) - (scatter * fits).sum(axis=-1)
         j, k = np.unravel_index(int(np.argmax(count)), count.shape)
         members = tuple(loose[index] for index in np.flatnonzero(fits[j, k]))

@@ -93,6 +93,7 @@ def make_plan(
     outside = context.report.envelope.check(trajectory) if context.report.envelope is not None else ()
     findings = (*context.report.findings, *scene.findings, *outside)
     best, worst = prediction(context.prediction_errors)
+    frames = context.prompt.for_scene(scene.keypoints).frames
     evidence = Evidence(
         agreement=chosen.confidence,
         vote=context.prompt.vote(scene.keypoints),
@@ -107,6 +108,7 @@ def make_plan(
         undecided=undecided(findings),
         doubled=len(scene.located.doubled),
         unexplained=worst,
+        frames=frames.error,
         recognition=scene.recognition,
     )
     unknown = evidence.unknown_notes if judged else ()
@@ -127,7 +129,7 @@ def make_plan(
         usage=Usage((scene.stage, *proposal.stages, *stages)),
         seconds=context.pace.seconds if context.pace else None,
         dwell=context.pace.dwell if context.pace else None,
-        frames=tuple(FrameUse(*use) for use in context.prompt.for_scene(scene.keypoints).frames.uses(scene.keypoints)),
+        frames=tuple(FrameUse(*use) for use in frames.uses(scene.keypoints)),
         notes=(
             *context.notes,
             *scene.notes,

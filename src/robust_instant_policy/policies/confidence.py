@@ -24,7 +24,7 @@ from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
     "constant": 3.85, "distortion": 1.66, "prediction": 1.88, "novelty": 1.08, "displacement": 1.34,
-    "precision": 1.03, "doubts": 1.0, "warnings": 1.48,
+    "precision": 1.03, "frames": 1.35, "doubts": 1.0, "warnings": 1.48,
 }  # fmt: skip
 UNKNOWN = 0.5  # factor, and so the most that is claimed, where the demonstrations cannot tell
 
@@ -51,7 +51,7 @@ UNRECOGNISED_NOTE = f"unchecked: the scene was hardly recognised; the confidence
 
 DISTORTED = 3.0  # `Evidence.distortion` above which a thing is another one than was demonstrated, or found wrongly
 
-UNEXPLAINED_M = 0.06  # `Evidence.unexplained` above which it is not known what demonstrations have in common
+UNEXPLAINED_M = 0.06  # `Evidence.unexplained` or `frames` above which what demonstrations have in common is not known
 
 RECOGNISED = 0.7  # of the least confidence in demonstrations, from which on a scene counts as recognised
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
@@ -60,6 +60,7 @@ GOOD_DISTORTION = 2.0
 GOOD_PREDICTION_M = 0.015
 GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT = 0.015, 1.5  # or that many times the demonstrations' own
 GOOD_PRECISION_M = 0.025
+GOOD_FRAMES_M = 0.010
 LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one scene
 NOISE_M = 0.02  # variation of a coordinate below which it says nothing about a scene
 RIGID_M = 0.010  # variation of the distance of two keypoints below which they belong to one rigid thing
@@ -80,11 +81,12 @@ class Evidence:
     ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``vote`` in [0, 1] for the way to act
     that was followed, 0 where either of two may be meant (`Prompt.vote`); ``distortion`` of the distances between
     keypoints (see `distortion`); ``prediction``, metres, the error with which demonstrations predict each other at the
-    key step at which they do so best, and ``unexplained``, that at which they do so worst; ``novelty``, how far the
-    scene lies from the demonstrations (see `novelty`); ``displacement``, metres, of the plan against what lies around
-    the gripper, and ``precision``, that of the demonstrations (`Surroundings`); how many findings are ``doubts`` about
-    the recording (`doubts`), other ``warnings``, and ``errors``, and how many warnings leave images and paths
-    ``undecided`` (`undecided`); how many objects with keypoints are ``doubled``: it is not known which is meant;
+    key step at which they do so best, and ``unexplained``, that at which they do so worst; ``frames``, metres, that of
+    frames that are fitted to the others alone (`StepFrames.error`); ``novelty``, how far the scene lies from the
+    demonstrations (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and
+    ``precision``, that of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording
+    (`doubts`), other ``warnings``, and ``errors``, and how many warnings leave images and paths ``undecided``
+    (`undecided`); how many objects with keypoints are ``doubled``: it is not known which is meant;
     ``recognition`` in [0, 1] of the scene (`recognition`), below 1 where it was hardly recognised.
     """
 
@@ -101,6 +103,7 @@ class Evidence:
     undecided: int = 0
     doubled: int = 0
     unexplained: float = float("nan")
+    frames: float = float("nan")
     recognition: float = float("nan")
 
     @property
@@ -110,9 +113,10 @@ class Evidence:
             f"warning: the keypoints of a thing lie {self.distortion:.1f} times farther from its demonstrated shape "
             f"than usual ({DISTORTED:.0f} are accepted): is it another thing? the confidence is at most {UNKNOWN}"
         )
+        worst = float(np.fmax(self.unexplained, self.frames))
         unexplained = (
             "warning: at a gripper change the demonstrations predict each other only to "
-            f"{self.unexplained * 1e3:.0f} mm ({UNEXPLAINED_M * 1e3:.0f} mm are accepted): what they have in common "
+            f"{worst * 1e3:.0f} mm ({UNEXPLAINED_M * 1e3:.0f} mm are accepted): what they have in common "
             f"there was not found; the confidence is at most {UNKNOWN}"
         )
         reasons = {
@@ -122,7 +126,7 @@ class Evidence:
             DOUBTED_NOTE: self.doubts > 0,
             UNRECOGNISED_NOTE: self.recognition < 1,
             distorted: self.distortion > DISTORTED,
-            unexplained: self.unexplained > UNEXPLAINED_M,
+            unexplained: worst > UNEXPLAINED_M,
         }
         return tuple(note for note, holds in reasons.items() if holds)
 
@@ -142,6 +146,7 @@ class Evidence:
             "displacement": self.displacement
             / max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision))),
             "precision": self.precision / GOOD_PRECISION_M,
+            "frames": self.frames / GOOD_FRAMES_M,
         }
         ratios = {name: -float(np.log(max(ratio, 1.0))) for name, ratio in found.items() if not np.isnan(ratio)}
         return {**dict.fromkeys(found, 0.0), **ratios, "doubts": -float(self.doubts), "warnings": -float(self.warnings)}

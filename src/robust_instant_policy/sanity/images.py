@@ -28,10 +28,7 @@ from robust_instant_policy.sanity.geometry import (
 from robust_instant_policy.sanity.view import View
 
 OWN_BETTER = 0.2  # by which the own images' consistency must exceed that of other images,
-DECISIVE, LEAST = (
-    4.0,
-    0.1,
-)  # times that of other images, and at least, from which a low consistency still tells them apart
+DECISIVE, LEAST = 4.0, 0.1  # times other images' consistency, and at least, from which a low one tells them apart
 SAME_EVERYWHERE = 0.95  # from which on what is around the gripper looks alike in all scenes, and nothing is told
 ROOM = 0.5  # and less where these leave less than that to the greatest, 1: scenes of which little moves
 CLOSE_M = 0.015  # gap from which a path is compared with other hypotheses, too
