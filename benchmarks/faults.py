@@ -556,6 +556,7 @@ def _image_faults() -> dict[str, tuple[Callable[[Observation], Observation], tup
         "depth-mirrored": (flipped(1, -1, rgb=False), ("depth", "mirrored")),
         "depth-flipped": (flipped(-1, 1, rgb=False), ("depth", "flipped")),
         "depth-not-aligned": (shifted_depth(24), ("colour", "aligned", "depth")),
+        "depth-6px": (shifted_depth(6), ("displaced",)),
         "depth-other-lens": (zoomed_depth, ("colour", "aligned", "depth")),
         "camera-10cm-low": (moved(z=-0.1), ("camera", "table")),
         "camera-10cm-high": (moved(z=0.1), ("camera", "table")),

@@ -308,6 +308,16 @@ def test_replies_without_an_answer_are_told_in_one_line(serve, body):
 
 
 @pytest.mark.parametrize(
+    ("response", "words"),
+    [(Response(b"<html><h1>Sign in</h1></html>"), "web page: 'Sign in'"), (Response(b"oops", 500), "answered 500")],
+)
+def test_a_server_that_serves_no_model_is_told_after_a_few_requests(serve, response, words):
+    server = serve(lambda _: response)
+    assert words in message_of(server, deadline_s=30.0)
+    assert len(server.requests) <= 8
+
+
+@pytest.mark.parametrize(
     ("status", "body"),
     [
         (200, {"error": "no GPU left"}),

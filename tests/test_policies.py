@@ -17,6 +17,7 @@ from robust_instant_policy.policies import (
 )
 from robust_instant_policy.policies.confidence import (
     UNKNOWN,
+    UNRECOGNISED_NOTE,
     Evidence,
     distortion,
     novelty,
@@ -25,6 +26,7 @@ from robust_instant_policy.policies.confidence import (
     recognition,
 )
 from robust_instant_policy.policies.context import HARDLY_RECOGNISED
+from robust_instant_policy.policies.neighbours import Neighbours
 from robust_instant_policy.policies.sampling import NO_SAMPLES
 from robust_instant_policy.query import Answer
 from robust_instant_policy.tasks import make_task
@@ -79,6 +81,9 @@ def test_only_a_scene_that_lacks_what_was_demonstrated_is_called_hardly_recognis
         scene, located=located, recognition=recognition(context.extractor.confidence_, located.confidence)
     )
     assert HARDLY_RECOGNISED in missing.notes
+    plan = Neighbours(SETTINGS).fit_context(context).plan_scene(missing)
+    assert plan.confidence <= UNKNOWN
+    assert UNRECOGNISED_NOTE in plan.notes
 
 
 def test_objects_that_demonstrations_recognise_with_little_confidence_may_be_so_in_a_scene():
@@ -229,7 +234,15 @@ def test_a_tie_or_an_error_of_a_check_leaves_no_confidence():
 
 @pytest.mark.parametrize(
     "unknown",
-    [{"prediction": np.nan}, {"novelty": np.nan}, {"undecided": 1}, {"distortion": 3.5}, {"doubled": 1}, {"doubts": 1}],
+    [
+        {"prediction": np.nan},
+        {"novelty": np.nan},
+        {"undecided": 1},
+        {"distortion": 3.5},
+        {"doubled": 1},
+        {"doubts": 1},
+        {"recognition": 0.9},
+    ],
 )
 def test_what_cannot_be_known_bounds_the_confidence(unknown):
     assert 0.4 < plan_confidence(replace(SURE, **unknown)) < UNKNOWN

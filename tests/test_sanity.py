@@ -77,6 +77,30 @@ def test_the_noise_of_a_depth_camera_is_no_error(demonstrations, scene):
     assert not errors(report.check_observation(noise.photograph(scene, 99)))
 
 
+def with_images(demonstrations, change):
+    return [replace(d, observation=change(d.observation)) for d in demonstrations]
+
+
+def test_depth_that_is_displaced_against_colour_in_demonstrations_is_told(demonstrations):
+    def upward(o):
+        return replace(o, depth=np.roll(o.depth, -5, axis=0))
+
+    with pytest.raises(GeometryError, match=r"in the demonstrations depth is displaced by \+0, -5 pixels"):
+        check_demonstrations(with_images(demonstrations[:3], upward)).raise_if_wrong()
+    one = [*with_images(demonstrations[:1], upward), *demonstrations[1:4]]
+    (found,) = [f for f in check_demonstrations(one).findings if f.kind == "registration"]
+    assert "in demonstration 0 depth is displaced by +0, -5 pixels" in found.message
+
+
+@pytest.mark.parametrize("weights", [(1 / 3, 1 / 3, 1 / 3), (0, 1, 0)], ids=["mean", "green"])
+def test_monochrome_images_in_which_objects_look_like_the_table_are_no_error(demonstrations, scene, weights):
+    def grey(o):
+        return replace(o, rgb=np.repeat((o.rgb @ np.array(weights)).astype(np.uint8)[..., None], 3, axis=-1))
+
+    report = check_demonstrations(with_images(demonstrations, grey))
+    assert not errors((*report.findings, *report.check_observation(grey(scene))))
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
@@ -146,6 +170,7 @@ def test_quaternions_read_in_the_wrong_order_are_named(demonstrations):
         ("black:scene", "colour"),
         ("bgr:scene", "red and blue are exchanged"),
         ("depth-other-lens:scene", "another lens"),
+        ("depth-6px:scene", r"depth is displaced by \+6, \+0 pixels \(1\d mm\)"),
         ("cropped-3%:scene", "one was cropped"),
         ("fx-half:scene", r"displaces what it shows by \d+ mm: intrinsics"),
         ("pitch-1deg:scene", r"displaces what it shows by 2\d mm: the camera pose is wrong"),
@@ -253,6 +278,31 @@ def test_grasps_beside_or_above_what_the_image_shows_are_doubted():
     assert not doubts((0.02, 0, 0))  # along the fingers' faces: as good a grasp as any
     assert re.search("whose middle lies 2[3-7] mm beside the gripper's", doubts((0, 0.025, 0))[0])
     assert "above or beside a surface" in doubts((0, 0, 0.04))[0]
+
+
+def test_a_path_that_reaches_as_low_as_the_others_into_a_hole_contradicts_nothing():
+    def lowered(shown, hole):
+        """Into a hole around the block, whose middle the image shows ``hole`` metres beside it."""
+        x, y = shown.trajectory.triplets[30, 0, 1:, :2].mean(axis=0)
+        rows, cols = np.mgrid[:200, :200] * 0.6 / 300 - 99.5 * 0.6 / 300
+        inside = (np.abs(cols - x) < 0.09) & (np.abs(-rows - y - hole) < 0.09) & (shown.observation.depth > 0.59)
+        depth = np.where(inside, np.float32(0.7), shown.observation.depth)
+        actions = shown.trajectory.actions.copy()
+        actions[:, [2, 5, 8]] -= 0.05 * np.clip((0.15 - actions[:, [5]]) / 0.13, 0, 1)
+        trajectory = Trajectory(actions, shown.trajectory.times)
+        return replace(shown, observation=replace(shown.observation, depth=depth), trajectory=trajectory)
+
+    shown = [lowered(one, 0.14 if index == 3 else 0.0) for index, one in enumerate(grasps(count=5))]
+    assert check_demonstrations(shown).findings == ()
+
+
+def test_surroundings_that_repeat_little_but_only_with_their_own_image_are_no_error():
+    rng = np.random.default_rng(0)
+    shown = []
+    for one in grasps():
+        middle = one.trajectory.triplets[30, 0, 1:, :2].mean(axis=0) + rng.uniform(-0.04, 0.04, 2)
+        shown.append(replace(one, observation=block(middle, (*rng.uniform(0.03, 0.07, 2), 0.05))))
+    assert not errors(check_demonstrations(shown).findings)
 
 
 def test_a_plan_beside_the_demonstrated_place_of_a_thing_is_measured():

@@ -31,6 +31,7 @@ PATIENCE = 0.5  # share of the remaining time that one request may take, so that
 HEAD_START = 0.25  # share of the time for which the first request goes alone, so that refusals are met once
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 8.0  # between repeats; doubles from the first to the longest
 MAX_UNREACHABLE = 6  # refused connections in a row after which the server counts as absent, about 8 s
+MAX_BROKEN = 3  # failures of one request inside a server that has answered nothing, after which it is given up
 FACTS_TIME_S = 10.0  # at most, for asking the server about itself
 MAX_CONCURRENT = 32  # requests under way at a time
 # If a reply counts fewer prompt tokens than this share of the estimate, the server cut the prompt. Tokenizers with a
@@ -118,11 +119,13 @@ class Endpoint:
                     self._told[address] = None
             return self._told[address]
 
+        broken = 0
         while self._server is None:
             try:
                 self._server = await discover(tell, self.url, self.name)
             except UnavailableError as failure:
-                if failure.absent or time.monotonic() + FIRST_PAUSE_S > end:
+                broken += failure.broken
+                if failure.absent or broken >= MAX_BROKEN or time.monotonic() + FIRST_PAUSE_S > end:
                     break
                 await asyncio.sleep(FIRST_PAUSE_S)
             else:
@@ -170,7 +173,7 @@ class Endpoint:
             self._adapt(used, refusal, body)
             return None
         except UnreadableReplyError as error:
-            raise UnavailableError(f"its reply could not be read ({error})") from None
+            raise UnavailableError(f"its reply could not be read ({error})", broken=True) from None
         self._refuse_truncated(query, reply.answers[0].prompt_tokens)
         if len(reply.answers) < count and self.dialect == used:
             self.dialect = replace(used, several=False)
@@ -209,6 +212,12 @@ class Endpoint:
 
     def absent(self, failure: UnavailableError) -> ModelError:
         return ModelError(f"nothing answers at {self.url} ({failure}); is the server running, and the address right?")
+
+    def broken(self, failure: UnavailableError) -> ModelError:
+        return ModelError(
+            f"{self.name} at {self.url} failed {MAX_BROKEN} times and answered nothing: {failure}; is it the address "
+            "of the API, and what does the server's log say?"
+        )
 
     def _refuse_truncated(self, query: Query, read: int) -> None:
         sent = estimate_tokens(query.text)
@@ -274,7 +283,7 @@ class _Plan:
 
     async def _ask(self, connection: Connection, index: int, samples: list[int]) -> None:
         """One request, repeated with growing pauses until something comes back."""
-        pause = FIRST_PAUSE_S
+        pause, broken = FIRST_PAUSE_S, 0
         while True:
             try:
                 async with self._room:
@@ -305,6 +314,9 @@ class _Plan:
                 self._unreachable = self._unreachable + 1 if failure.absent else 0
                 if self._unreachable >= MAX_UNREACHABLE:
                     raise self._endpoint.absent(failure) from None
+                broken += failure.broken
+                if broken >= MAX_BROKEN and self._tally.is_empty:
+                    raise self._endpoint.broken(failure) from None
                 # The pause is a lower bound, also if the server asks for a shorter one.
                 await asyncio.sleep(max(failure.wait_s, pause * random.uniform(0.5, 1.0)))
                 pause = min(2 * pause, LONGEST_PAUSE_S)

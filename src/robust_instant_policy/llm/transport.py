@@ -28,11 +28,11 @@ _PASSING_WORDS = re.compile(r"overload|rate.?limit|capacity|too many|try again|u
 
 class UnavailableError(Exception):
     """The request may succeed later. ``wait_s`` is the pause that the server asks for; ``absent``: no server listens at
-    the address."""
+    the address; ``broken``: it fails inside, or its reply is not JSON, which seldom passes."""
 
-    def __init__(self, message: str, wait_s: float = 0.0, absent: bool = False):
+    def __init__(self, message: str, wait_s: float = 0.0, absent: bool = False, broken: bool = False):
         super().__init__(message)
-        self.wait_s, self.absent = wait_s, absent
+        self.wait_s, self.absent, self.broken = wait_s, absent, broken
 
 
 class RefusedError(Exception):
@@ -95,10 +95,13 @@ class Connection:
             raise UnavailableError(f"the connection failed ({reason})", absent=absent) from None
         if not response.is_success:
             raise self._failure(response.status_code, response.headers, content)
+        if content.lstrip()[:1] == b"<":  # web interfaces answer so to addresses that they do not know
+            page = f"its reply could not be read (it is a web page: {read_complaint(content).message[:80]!r})"
+            raise RefusedError(404, Complaint(page))
         try:
             reply = read_json(content)
         except UnreadableReplyError as error:
-            raise UnavailableError(f"its reply could not be read ({error})") from None
+            raise UnavailableError(f"its reply could not be read ({error})", broken=True) from None
         if isinstance(reply, dict) and reply.get("error") and not reply.get("choices"):
             # Gateways send errors inside HTTP 200.
             code = reply["error"].get("code") if isinstance(reply["error"], dict) else None
@@ -118,7 +121,8 @@ class Connection:
         if b"insufficient_quota" in content:
             return ModelError(f"{self.url} refused the request: {complaint.message}")
         if status in _PASSING_STATUS:
-            return UnavailableError(f"it answered {status} ({complaint.message})", _retry_after(headers))
+            words = f"it answered {status} ({complaint.message})"
+            return UnavailableError(words, _retry_after(headers), broken=status == 500)
         return RefusedError(status, complaint)
 
     async def _raise_for_tls(self, error: httpx2.TransportError) -> None:

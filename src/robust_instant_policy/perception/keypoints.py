@@ -224,7 +224,8 @@ class KeypointExtractor:
             notes.append(f"keypoint {k} has no depth at its pixel; it is where its object says")
         for number, found in enumerate(registrations):
             if found.fitness < MIN_FITNESS and counts[number]:
-                notes.append(f"object {number} was hardly recognised (fit {found.fitness:.2f})")
+                share = f"{counts[number]} of {sum(counts)} keypoints"
+                notes.append(f"object {number}, with {share}, was hardly recognised (fit {found.fitness:.2f})")
         return Located(transform_points(view.to_world, points), pixels, np.clip(confidence, 0, 1), tuple(notes))
 
 

@@ -109,6 +109,7 @@ def make_plan(
         doubled=len(scene.located.doubled),
         unexplained=worst,
         frames=frames.error,
+        recognition=scene.recognition,
     )
     unknown = evidence.unknown_notes if judged else ()
     beside = (evidence.displacement_note,) if evidence.features()["displacement"] else ()

@@ -34,7 +34,7 @@ UNKNOWN_NOTE = (
 )
 
 UNDECIDED_NOTE = (
-    "unchecked: it could not be decided whether images and paths belong together, or depth is missing; "
+    "unchecked: it could not be decided whether images, camera and paths belong together, or depth is missing; "
     f"the confidence is at most {UNKNOWN}"
 )
 
@@ -46,6 +46,8 @@ DOUBTED_NOTE = (
     "unchecked: gripper states, grasps or rotations seem to be recorded wrongly, as a warning says; "
     f"the confidence is at most {UNKNOWN}"
 )
+
+UNRECOGNISED_NOTE = f"unchecked: the scene was hardly recognised; the confidence is at most {UNKNOWN}"
 
 DISTORTED = 3.0  # `Evidence.distortion` above which a thing is another one than was demonstrated, or found wrongly
 
@@ -65,7 +67,10 @@ RIGID_M = 0.010  # variation of the distance of two keypoints below which they b
 DISTANCE_M = 0.003  # with which a distance between keypoints is measured
 # Kinds of findings: that doubt the recording, and that leave open whether images and paths belong together.
 RECORDING = {"gripper state", "grasp", "rotation"}
-UNDECIDED = {"contact", "hole"}
+UNDECIDED = {
+    "warning": {"contact", "hole", "registration", "colour and depth", "scenery", "table"},
+    "unchecked": {"contact", "scenery"},
+}
 MIN_SCENES = 3  # below which nothing is known of their variation
 
 
@@ -81,7 +86,8 @@ class Evidence:
     demonstrations (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and
     ``precision``, that of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording
     (`doubts`), other ``warnings``, and ``errors``, and how many warnings leave images and paths ``undecided``
-    (`undecided`); how many objects with keypoints are ``doubled``: it is not known which is meant.
+    (`undecided`); how many objects with keypoints are ``doubled``: it is not known which is meant;
+    ``recognition`` in [0, 1] of the scene (`recognition`), below 1 where it was hardly recognised.
     """
 
     agreement: float
@@ -98,6 +104,7 @@ class Evidence:
     doubled: int = 0
     unexplained: float = float("nan")
     frames: float = float("nan")
+    recognition: float = float("nan")
 
     @property
     def unknown_notes(self) -> tuple[str, ...]:
@@ -117,6 +124,7 @@ class Evidence:
             UNDECIDED_NOTE: self.undecided > 0,
             DOUBLED_NOTE: self.doubled > 0,
             DOUBTED_NOTE: self.doubts > 0,
+            UNRECOGNISED_NOTE: self.recognition < 1,
             distorted: self.distortion > DISTORTED,
             unexplained: worst > UNEXPLAINED_M,
         }
@@ -160,9 +168,9 @@ def doubts(findings: Sequence[Finding]) -> int:
 
 
 def undecided(findings: Sequence[Finding]) -> int:
-    """How many ``findings`` are warnings that images and paths fit no better, or less well, than under a mistake, or
-    that depth is missing where a thing may be."""
-    return sum(f.severity == "warning" and f.kind in UNDECIDED for f in findings)
+    """How many ``findings`` say that it is open whether images, camera and paths belong together, or that depth is
+    missing where a thing may be."""
+    return sum(f.kind in UNDECIDED.get(f.severity, ()) for f in findings)
 
 
 def prediction(errors: FloatArray) -> tuple[float, float]:

@@ -24,6 +24,7 @@ NEAR_SHARE = 0.16  # of the image that a depth image may be displaced to be call
 CLEARLY = 1.35  # times as strong as by chance: edges agree
 DISTINCT_EDGES = 1.6  # times as strong as by chance, which does not happen by chance in a sound image
 NAMED = 1.25  # times as strong as now: a displacement or turn that explains it
+ALONG = 0.6  # strength, of 1, of colour edges along depth edges that belong to them; by chance, over many tries, less
 
 
 @dataclass(frozen=True)
@@ -80,12 +81,9 @@ def agreement(view: View) -> Agreement:
     window = sums[middle[0] - reach[0] : middle[0] + reach[0] + 1, middle[1] - reach[1] : middle[1] + reach[1] + 1]
     row, col = np.unravel_index(int(window.argmax()), window.shape)
     by = np.array([col - reach[1], row - reach[0]]) * view.every
-    tried.append(
-        (
-            float(window.max()),
-            f"depth moved by {by[0]:+d}, {by[1]:+d} pixels (it is not aligned to colour, or of another scene)",
-        )
-    )
+    if 0 < row < 2 * reach[0] and 0 < col < 2 * reach[1]:  # else the best may lie beyond
+        words = f"depth moved by {by[0]:+d}, {by[1]:+d} pixels (it is not aligned to colour, or of another scene)"
+        tried.append((float(window.max()), words))
     best, cause = max(tried)
     return Agreement(own, chance, best, cause if best > NAMED * max(own, chance) else "")
 
@@ -112,15 +110,14 @@ def check_agreement(views: Sequence[View], found: Sequence[Agreement]) -> list[F
         return [Finding("colour and depth", "warning", words, numbers)] if low else []
     if len({view.depth.shape for view in views}) == 1:
         moved, best, as_is = exchanged(views)
-        if moved > len(views) / 2 and best > CLEARLY * as_is:
+        if moved > len(views) / 2 and best > max(ALONG, CLEARLY * as_is):
             words = (
                 f"edges of depth are no edges of colour; with other colour images ({moved} of {len(views)}) they are"
             )
             advice = f" ({best / max(as_is, 1e-9):.1f} times stronger): pair each depth image with its own colour image"
             cause = "colour and depth of different episodes"
             return [Finding("colour and depth", "error", words + advice, numbers, cause)]
-    causes = [one.cause for one in found if one.cause]
-    kinds = [cause.split(" (")[0] for cause in causes]
+    kinds = [one.cause.split(" (")[0] for one in found if one.cause and one.best > ALONG]
     common = max(set(kinds), key=kinds.count, default="")
     if common and kinds.count(common) >= MIN_SHARE * len(found):
         words = f"edges of depth are no edges of colour ({usual:.1f} times chance); with {common} they are"

@@ -23,14 +23,16 @@ class Contact:
     ``path`` is the smallest gap over the path between the fingers and a raised surface (0: it passes through what
     the image shows there); ``grasps (G,)`` the gaps where grippers close; ``lowest`` the smallest height of a
     fingertip above the table, ``lowest_gripper_point`` that of a gripper point, where the table is seen: elsewhere
-    there may be a hole; ``buried`` the largest depth of a gripper point behind a raised surface that also lies above
-    it: what is only behind one may be free, if the camera looks from the side.
+    there may be a hole; ``least_height`` that of both above the table's plane, hole or not; ``buried`` the largest
+    depth of a gripper point behind a raised surface that also lies above it: what is only behind one may be free, if
+    the camera looks from the side.
     """
 
     path: float
     grasps: FloatArray
     lowest: float
     lowest_gripper_point: float
+    least_height: float
     buried: float
 
 
@@ -88,5 +90,6 @@ def contact(view: View, path: GripperPath) -> Contact:
         grasps=gaps(view, path.closings),
         lowest=float(view.above_table(path.tips).min()),
         lowest_gripper_point=float(view.above_table(path.gripper_points).min()),
+        least_height=float(view.above_plane(np.concatenate([path.tips, path.gripper_points])).min()),
         buried=float(buried.max(initial=0.0)),
     )

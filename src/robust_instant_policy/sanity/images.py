@@ -12,21 +12,23 @@ from robust_instant_policy.sanity.consistency import MIN_DEMONSTRATIONS
 from robust_instant_policy.sanity.contact import GripperPath
 from robust_instant_policy.sanity.finding import Finding, Severity
 from robust_instant_policy.sanity.geometry import (
+    BELOW_TABLE_M,
     BURIED_M,
     CONSISTENT,
+    EXPLAINED,
     FAR_M,
     MIN_SHARE,
     TOUCH_M,
     Evidence,
     Explanation,
     explain,
-    fits,
     is_above,
     pairing_scores,
 )
 from robust_instant_policy.sanity.view import View
 
 OWN_BETTER = 0.2  # by which the own images' consistency must exceed that of other images,
+DECISIVE, LEAST = 4.0, 0.1  # times other images' consistency, and at least, from which a low one tells them apart
 SAME_EVERYWHERE = 0.95  # from which on what is around the gripper looks alike in all scenes, and nothing is told
 ROOM = 0.5  # and less where these leave less than that to the greatest, 1: scenes of which little moves
 CLOSE_M = 0.015  # gap from which a path is compared with other hypotheses, too
@@ -78,12 +80,17 @@ def check_contact(
         return [Finding("contact", "warning" if fits_as_is else "error", words, numbers, explanation.cause)]
     if right:
         return _outliers(views, as_is)
-    severity, words, cause = _unexplained(views, as_is, own, other)
+    if (unexplained := _unexplained(views, as_is, own, other)) is None:
+        return []
+    severity, words, cause = unexplained
     return [Finding("contact", severity, words, numbers, cause)]
 
 
-def _unexplained(views: Sequence[View], as_is: Evidence, own: float, other: float) -> tuple[Severity, str, str]:
-    """Severity, words and cause where no hypothesis fits; consistency with the ``own`` and ``other`` images."""
+def _unexplained(views: Sequence[View], as_is: Evidence, own: float, other: float) -> tuple[Severity, str, str] | None:
+    """Severity, words and cause where no hypothesis fits; consistency with the ``own`` and ``other`` images.
+
+    None where all fits, only that the surroundings repeat little, but far more than with other images.
+    """
     closes = any(len(c.grasps) for c in as_is.contacts)
     score = as_is.surroundings.score
     if not as_is.is_clear:
@@ -105,12 +112,19 @@ def _unexplained(views: Sequence[View], as_is: Evidence, own: float, other: floa
         words = f"the paths fit their own images no better than each other's ({own:.2f} against {other:.2f} of 1)"
         advice = "trajectories are shuffled against images, or the images are mirrored, or of another camera"
         return "error", f"{words}; {advice}", "other images"
+    if own >= EXPLAINED and own > DECISIVE * other:
+        return None
     words = f"what the images show around the gripper hardly repeats across the demonstrations ({score:.2f} of 1)"
     return "unchecked", f"{words}: whether the camera is right was not decided", ""
 
 
 def _fit_others(own: float, other: float) -> bool:
-    """Whether paths fit ``other`` images about as well as their ``own``; False where either is unknown."""
+    """Whether paths fit ``other`` images about as well as their ``own``; False where either is unknown.
+
+    Clutter lowers both: then the ratio tells.
+    """
+    if own >= LEAST and own > DECISIVE * other:
+        return False
     return own < other + OWN_BETTER * min(1.0, (1 - other) / ROOM)
 
 
@@ -147,24 +161,29 @@ def _explained(explanation: Explanation) -> str:
 
 
 def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
-    """Single demonstrations whose path does not fit their image while the others' do."""
+    """Single demonstrations whose path does not fit their image while the others' do.
+
+    What most do is no contradiction: one may reach as low as they do, as into a hole of which its image shows less.
+    """
     if len(views) < MIN_DEMONSTRATIONS + 1:
         return []
     likeness = as_is.surroundings.likeness
     usual = float(np.median(likeness))
+    low = np.median([c.least_height for c in as_is.contacts]) - BELOW_TABLE_M
+    deep = np.median([c.buried for c in as_is.contacts]) + BELOW_TABLE_M
     found = []
     for index, (c, view) in enumerate(zip(as_is.contacts, views, strict=True)):
         unlike = usual >= ALIKE and likeness[index] < UNLIKE
         apart = c.path > FAR_FROM_ALL_M and as_is.touching > 1 - MIN_SHARE
-        if not (unlike or apart or not fits(c, view)):
+        below = c.least_height < low and not is_above(c, view)
+        if not (unlike or apart or below or c.buried > max(BURIED_M, deep)):
             continue
         words = (
             f"demonstration {index} contradicts the others: its path comes within {c.path * 1e3:.0f} mm of a surface, "
             f"its lowest fingertip is {c.lowest * 1e3:.0f} mm above the table, and it is {likeness[index]:.2f} like "
             f"the others ({usual:.2f}); look at it, and remove it if it is wrong"
         )
-        below = not is_above(c, view) and likeness[index] < ALIKE
-        severity: Severity = "error" if apart or below else "warning"
+        severity: Severity = "error" if apart or (below and likeness[index] < ALIKE) else "warning"
         numbers = {"demonstration": float(index), "path_gap": c.path, "likeness": float(likeness[index])}
         found.append(Finding("contradiction", severity, words, numbers, f"demonstration {index}"))
     return found

@@ -13,6 +13,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.agreement import agreement, check_agreement, check_scene_agreement
 from robust_instant_policy.sanity.consistency import gripper_poses
 from robust_instant_policy.sanity.contact import GripperPath
+from robust_instant_policy.sanity.depth_shift import Shift, check_depth_shift, check_scene_depth_shift
 from robust_instant_policy.sanity.envelope import Envelope
 from robust_instant_policy.sanity.episodes import check_episodes
 from robust_instant_policy.sanity.finding import DemonstrationError, Finding, GeometryError, Severity, errors
@@ -39,7 +40,8 @@ class Reference:
     """What sound demonstrations have in common.
 
     ``plane (4,)`` of the table and ``centre (3,)`` on it; ``scenery`` of a fixed camera, None where there is none;
-    ``evidence`` of paths and images; ``edges (I,)`` the ratios of colour and depth edges, as far as there are any;
+    ``evidence`` of paths and images; ``edges (I,)`` the ratios of colour and depth edges, as far as there are any, and
+    ``depth_shift`` of depth against colour, pixels;
     ``object_centres (I, 3)`` of what is raised in each scene, and ``scene_spread_m`` how far they spread (metres, NaN
     unknown); ``widest_hole`` of the depth images, metres from its middle to its rim.
     """
@@ -49,6 +51,7 @@ class Reference:
     scenery: Scenery | None
     evidence: Evidence
     edges: FloatArray
+    depth_shift: Shift
     object_centres: FloatArray
     scene_spread_m: float
     widest_hole: float
@@ -86,6 +89,7 @@ class SetReport:
         if known.scenery is not None:
             found += check_against_scenery(view, known.scenery)
         found += check_table(view, known.plane, known.centre) + check_hole(view, known.widest_hole)
+        found += check_scene_depth_shift(view, known.depth_shift)
         found += check_scene_agreement(agreement(view), known.edges)
         return (*found, *_check_novelty(view, known))
 
@@ -99,7 +103,7 @@ class SetReport:
 
 GEOMETRIC = {
     "contact", "camera", "camera pose", "intrinsics", "depth", "depth unit", "colour", "colour and depth", "table",
-    "scenery", "rotation",
+    "scenery", "rotation", "registration",
 }  # fmt: skip
 
 
@@ -127,7 +131,8 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
     edges = [agreement(view) for view in views]
     found += check_tool_frame(demonstrations, views, as_is) + check_openings(demonstrations, views)
     found += check_fingers(demonstrations, views) + check_direction(demonstrations, views)
-    found += check_agreement(views, edges)
+    displaced, depth_shift = check_depth_shift(views)
+    found += displaced + check_agreement(views, edges)
     spread = scene_spread(views)
     if len(views) > 1 and np.isfinite(spread) and spread < ONE_SCENE_M:
         words = (
@@ -149,6 +154,7 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
         Scenery.of(views) if fixed and same_size else None,
         as_is,
         np.array([edge.ratio for edge in edges if np.isfinite(edge.ratio)]),
+        depth_shift,
         np.array([view.object_centre for view in views]),
         spread,
         max(float(view.holes.max()) for view in views),

@@ -74,7 +74,7 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
         words = f"the camera is {change}, and where its calibration puts the table the texture is another"
         advice = f" ({there:.2f} against {scenery.texture:.2f}): is the new calibration right, and the table the same?"
         found.append(
-            Finding("camera", "warning", words + advice, {**numbers, "texture_in_world": there}, "camera moved")
+            Finding("scenery", "warning", words + advice, {**numbers, "texture_in_world": there}, "camera moved")
         )
     return found
 
