@@ -321,9 +321,10 @@ def _with_weighted_points(
         steps = np.flatnonzero(picks[:, 1] == number) if origin.by_axis else ()
         for step in sorted(steps, key=errors.cost.min(axis=(1, 2)).__getitem__):
             shares = frames[step].shares[0]
-            if all(np.abs(shares - other).max() > OTHER_SHARES for other in different[:MAX_SHARES]):
+            is_new = all(np.abs(shares - known).max() > OTHER_SHARES for known in different)
+            if is_new and len(different) < MAX_SHARES:
                 different.append(shares)
-        origins += [replace(origin, shares=shares) for shares in different[:MAX_SHARES]] or [origin]
+        origins += [replace(origin, shares=shares) for shares in different] or [origin]
     return replace(candidates, origins=tuple(origins))
 
 

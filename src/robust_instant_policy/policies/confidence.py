@@ -85,7 +85,7 @@ class Evidence:
     frames that are fitted to the others alone (`StepFrames.error`); ``novelty``, how far the scene lies from the
     demonstrations (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and
     ``precision``, that of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording
-    (`doubts`), other ``warnings``, and ``errors``, and how many warnings leave images and paths ``undecided``
+    (`doubts`), other ``warnings``, and ``errors``, and how many leave open whether images and paths belong together
     (`undecided`); how many objects with keypoints are ``doubled``: it is not known which is meant;
     ``recognition`` in [0, 1] of the scene (`recognition`), below 1 where it was hardly recognised.
     """

@@ -28,9 +28,9 @@ from robust_instant_policy.sanity.geometry import (
 from robust_instant_policy.sanity.view import View
 
 OWN_BETTER = 0.2  # by which the own images' consistency must exceed that of other images,
+ROOM = 0.5  # and less where these leave less than that to the greatest, 1: scenes of which little moves
 DECISIVE, LEAST = 4.0, 0.1  # times other images' consistency, and at least, from which a low one tells them apart
 SAME_EVERYWHERE = 0.95  # from which on what is around the gripper looks alike in all scenes, and nothing is told
-ROOM = 0.5  # and less where these leave less than that to the greatest, 1: scenes of which little moves
 CLOSE_M = 0.015  # gap from which a path is compared with other hypotheses, too
 ONE_SCENE_M = 0.01  # spread of the objects below which all demonstrations show one scene
 UNLIKE = 0.25  # likeness below which a demonstration contradicts the others,
