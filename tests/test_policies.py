@@ -86,6 +86,10 @@ def test_only_a_scene_that_lacks_what_was_demonstrated_is_called_hardly_recognis
     assert UNRECOGNISED_NOTE in plan.notes
 
 
+def test_a_confidence_that_is_no_number_recognises_nothing():
+    assert recognition(np.ones((3, 4)), np.array([np.nan, np.nan, 1.0, 1.0])) == 0.0
+
+
 def test_objects_that_demonstrations_recognise_with_little_confidence_may_be_so_in_a_scene():
     sure, unsure = np.full((4, 10), 0.8), np.full((4, 10), 0.4)
     assert recognition(unsure, np.full(10, 0.35)) == 1
