@@ -73,7 +73,7 @@ def depth_shift(strength: FloatArray) -> Shift:
 
 
 def sound_shift(view: View) -> float:
-    """Displacement, pixels, that sound images may have: depth edges lie `RAISED_M` above the table, colour edges on it."""
+    """Displacement, pixels, of sound images at most: depth edges lie `RAISED_M` above the table, colour edges on it."""
     down = abs(float(view.plane[:3] @ view.observation.camera_pose[:3, 2]))  # cosine of the camera's tilt
     pixels = view.observation.intrinsics[0, 0] / float(np.nanmedian(view.depth))  # a metre
     return max(ALIGNED_PX, RAISED_M * pixels * float(np.sqrt(max(1 - down**2, 0.0))))
