@@ -389,3 +389,24 @@ def test_a_scene_with_another_number_of_keypoints_is_refused():
 def test_an_unknown_option_names_the_known_ones(options):
     with pytest.raises(InvalidValueError, match="must be '"):
         write_prompt(*demonstrations(2), **options)
+
+
+@pytest.mark.filterwarnings("error")
+def test_keypoints_that_coincide_are_one_thing_of_no_size():
+    keypoints, trajectories = demonstrations(4)
+    together = np.repeat(keypoints[:, :1], 5, axis=1)
+    prompt = write_prompt(together, trajectories)
+    assert np.isfinite(prompt.for_scene(together[0]).frames.poses(together[0])).all()
+
+
+def test_nothing_to_align_is_told():
+    with pytest.raises(InvalidValueError, match="no trajectories"):
+        align([])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_keypoints_that_are_not_finite_are_told(value):
+    keypoints, trajectories = demonstrations(4)
+    keypoints[1, 2, 0] = value
+    with pytest.raises(InvalidValueError, match=r"keypoints \(4, 10, 3\) hold values that are not finite"):
+        write_prompt(keypoints, trajectories)

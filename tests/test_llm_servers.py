@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 
 from robust_instant_policy.errors import ModelError, UsageError
-from robust_instant_policy.llm import Listener, Sampling, connect, refusal_advice
+from robust_instant_policy.llm import Listener, Sampling, check_server, connect, refusal_advice
+from robust_instant_policy.llm.endpoint import MAX_BROKEN, MAX_EMPTY
 from robust_instant_policy.query import Answer, Query
 from tests.fuzz_targets_llm import read_pair
 from tests.stand_in_server import NOT_FOUND, Request, Response, Script, StandInServer, chat, completion, error
@@ -315,6 +316,22 @@ def test_a_server_that_serves_no_model_is_told_after_a_few_requests(serve, respo
     server = serve(lambda _: response)
     assert words in message_of(server, deadline_s=30.0)
     assert len(server.requests) <= 8
+
+
+@pytest.mark.parametrize(
+    ("response", "words"), [(Response(b"oops", 500), "answered 500"), (Response({"hello": 1}), "it holds no answer")]
+)
+def test_a_server_that_serves_no_model_is_told_before_any_work(serve, response, words):
+    server = serve(plain(lambda _: response))
+    with pytest.raises(ModelError, match=words):
+        check_server(f"{server.url}#m")
+    assert len(server.asked) == MAX_BROKEN
+
+
+def test_a_model_that_says_nothing_is_told_after_the_first_few_requests(serve):
+    server = serve(plain(lambda request: chat(*[None] * request.body.get("n", 1))))
+    assert "replies without text and no answer" in message_of(server, queries=16, n=5)
+    assert len(server.asked) == MAX_EMPTY
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,13 @@ def test_a_confidence_that_is_no_number_recognises_nothing():
     assert recognition(np.ones((3, 4)), np.array([np.nan, np.nan, 1.0, 1.0])) == 0.0
 
 
+@pytest.mark.parametrize("count", [2, 4, 10])
+def test_one_hidden_keypoint_is_recognised_and_a_missing_half_is_not(count):
+    sure = np.ones((3, count))
+    assert recognition(sure, np.array([0.0, *[1.0] * (count - 1)])) == 1.0
+    assert recognition(sure, np.repeat([0.0, 1.0], [max(2, count // 2), count - max(2, count // 2)])) == 0.0
+
+
 def test_objects_that_demonstrations_recognise_with_little_confidence_may_be_so_in_a_scene():
     sure, unsure = np.full((4, 10), 0.8), np.full((4, 10), 0.4)
     assert recognition(unsure, np.full(10, 0.35)) == 1

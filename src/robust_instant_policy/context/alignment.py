@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from robust_instant_policy.context.choice import NOISE_M
+from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
@@ -62,8 +63,10 @@ def align(trajectories: Sequence[Trajectory]) -> AlignedDemonstrations:
     """Resample ``trajectories`` to a common number of steps: in each segment the median of theirs.
 
     Demonstrations whose order of gripper states is not that of the majority are left out. Without a majority all are
-    resampled evenly over their whole length.
+    resampled evenly over their whole length. Raises `InvalidValueError` without trajectories.
     """
+    if not trajectories:
+        raise InvalidValueError("no trajectories to align")
     segments = [_segments(trajectory) for trajectory in trajectories]
     orders = [tuple(state for state, _, _ in parts) for parts in segments]
     order, votes = Counter(orders).most_common(1)[0]

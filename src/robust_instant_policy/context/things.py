@@ -140,7 +140,8 @@ def _located(thing: Thing, keypoints: FloatArray, found: Scene) -> Located:
         ratio = ratio / (np.abs(_complex(thing.shape)) ** 2).sum()
         return Located(rotations_about_vertical(np.angle(ratio)), middle, np.abs(ratio), unit)
     poses, hand, _ = _fit_either_hand(thing.shape, points, thing.kind == "upright", thing.mirrors)
-    return Located(poses[:, :3, :3], poses[:, :3, 3], _rms_radius(points, 3) / _rms_radius(thing.shape[None], 3), hand)
+    radius = float(_rms_radius(thing.shape[None], 3)[0])  # 0 where all its keypoints coincide
+    return Located(poses[:, :3, :3], poses[:, :3, 3], _rms_radius(points, 3) / radius if radius else unit, hand)
 
 
 def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:

@@ -32,6 +32,7 @@ HEAD_START = 0.25  # share of the time for which the first request goes alone, s
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 8.0  # between repeats; doubles from the first to the longest
 MAX_UNREACHABLE = 6  # refused connections in a row after which the server counts as absent, about 8 s
 MAX_BROKEN = 3  # failures of one request inside a server that has answered nothing, after which it is given up
+MAX_EMPTY = 3  # replies without text before any answer was accepted, after which the model is given up
 FACTS_TIME_S = 10.0  # at most, for asking the server about itself
 MAX_CONCURRENT = 32  # requests under way at a time
 # If a reply counts fewer prompt tokens than this share of the estimate, the server cut the prompt. Tokenizers with a
@@ -79,20 +80,28 @@ class Endpoint:
         return tally.answers()
 
     def check(self) -> None:
-        """One short request. Raises `ModelError` where nothing listens at the address, or the key, the address or the
-        model is refused; a server that is slow or busy passes."""
+        """One short request. Raises `ModelError` where nothing listens at the address, the key, the address or the
+        model is refused, or the request fails inside the server `MAX_BROKEN` times; a slow or busy server passes."""
 
         async def ask() -> None:
             async with contextlib.aclosing(self.connection()) as connection:
                 await self.learn(connection, CHECK_TIME_S)
-                while await self.ask(connection, SHORT, 1, 0.0, 0, CHECK_TIME_S) is None:
-                    pass  # in another dialect
+                broken = 0
+                while True:
+                    try:
+                        if await self.ask(connection, SHORT, 1, 0.0, 0, CHECK_TIME_S) is not None:
+                            return
+                    except UnavailableError as failure:
+                        if failure.absent:
+                            raise self.absent(failure) from None
+                        if not failure.broken:
+                            return
+                        broken += 1
+                        if broken == MAX_BROKEN:
+                            raise self.broken(failure) from None
+                        await asyncio.sleep(FIRST_PAUSE_S)
 
-        try:
-            _run(ask())
-        except UnavailableError as failure:
-            if failure.absent:
-                raise self.absent(failure) from None
+        _run(ask())
 
     def close(self) -> None:
         """Nothing is held between plans."""
@@ -219,6 +228,13 @@ class Endpoint:
             "of the API, and what does the server's log say?"
         )
 
+    def silent(self, answer: Answer) -> ModelError:
+        fault = f" ({answer.fault})" if answer.fault else ""
+        return ModelError(
+            f"{self.name} at {self.url} gave {MAX_EMPTY} replies without text{fault} and no answer; is it a model for "
+            "text, and what does the server's log say?"
+        )
+
     def _refuse_truncated(self, query: Query, read: int) -> None:
         sent = estimate_tokens(query.text)
         if sent >= MIN_TOKENS_TO_COMPARE and 0 < read < TRUNCATED_SHARE * sent:
@@ -236,7 +252,7 @@ class _Plan:
         self._deadline = time.monotonic() + sampling.deadline_s
         self._room = asyncio.Semaphore(MAX_CONCURRENT)
         self._opened = asyncio.Event()  # the first request has met the server
-        self._unreachable = 0
+        self._unreachable = self._empty = 0
         self._last_failure = "nothing came back"
 
     async def carry_out(self) -> None:
@@ -305,6 +321,10 @@ class _Plan:
                     self._tally.add(index, sample, answer)
                 if reply.ran_out and (reply.thought or used.style == "chat") and not self._tally.has_accepted:
                     self._endpoint.make_room(used, reply.answers[0])
+                elif not any(answer.text for answer in reply.answers) and not self._tally.has_accepted:
+                    self._empty += 1
+                    if self._empty == MAX_EMPTY:
+                        raise self._endpoint.silent(reply.answers[0])
                 else:
                     self._endpoint.is_known = True
                     self._opened.set()

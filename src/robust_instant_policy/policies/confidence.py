@@ -252,4 +252,4 @@ def recognition(demonstrated: FloatArray, keypoint_confidence: FloatArray) -> fl
         return 1.0
     least = RECOGNISED * demonstrated[1:].min(axis=0)
     ratio = np.divide(keypoint_confidence, least, out=np.ones_like(keypoint_confidence), where=least > 0)
-    return float(np.clip(np.quantile(np.nan_to_num(ratio), 0.25), 0.0, 1.0))
+    return float(np.clip(np.quantile(np.nan_to_num(ratio), 0.25, method="higher"), 0.0, 1.0))
