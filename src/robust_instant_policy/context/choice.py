@@ -244,7 +244,7 @@ def _guess(candidates: Candidates, offset: FloatArray, demos: int) -> FloatArray
     for index, origin in enumerate(candidates.origins):
         thing = origin.ends[0]
         if thing.shape is not None:
-            radius = ((thing.shape - thing.shape.mean(axis=0)) ** 2).sum()
+            radius = max(((thing.shape - thing.shape.mean(axis=0)) ** 2).sum(), NOISE_M**2)
             noise[index] = NOISE_M**2 * (1 / len(thing.shape) + distance[index] ** 2 / radius)
         for row, axes in enumerate(candidates.axes):
             own = axes.ends[0].thing
