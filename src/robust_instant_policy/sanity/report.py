@@ -10,10 +10,16 @@ import numpy as np
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.sanity.agreement import agreement, check_agreement, check_scene_agreement
+from robust_instant_policy.sanity.agreement import (
+    Shift,
+    agreement,
+    check_agreement,
+    check_depth_shift,
+    check_scene_agreement,
+    check_scene_depth_shift,
+)
 from robust_instant_policy.sanity.consistency import gripper_poses
 from robust_instant_policy.sanity.contact import GripperPath
-from robust_instant_policy.sanity.depth_shift import Shift, check_depth_shift, check_scene_depth_shift
 from robust_instant_policy.sanity.envelope import Envelope
 from robust_instant_policy.sanity.episodes import check_episodes
 from robust_instant_policy.sanity.finding import DemonstrationError, Finding, GeometryError, Severity, errors
@@ -89,8 +95,8 @@ class SetReport:
         if known.scenery is not None:
             found += check_against_scenery(view, known.scenery)
         found += check_table(view, known.plane, known.centre) + check_hole(view, known.widest_hole)
-        found += check_scene_depth_shift(view, known.depth_shift)
-        found += check_scene_agreement(agreement(view), known.edges)
+        edges = agreement(view)
+        found += check_scene_depth_shift(view, edges, known.depth_shift) + check_scene_agreement(edges, known.edges)
         return (*found, *_check_novelty(view, known))
 
     def require_observation(self, observation: Observation) -> tuple[Finding, ...]:
@@ -131,7 +137,7 @@ def check_demonstrations(demonstrations: Sequence[Demonstration]) -> SetReport:
     edges = [agreement(view) for view in views]
     found += check_tool_frame(demonstrations, views, as_is) + check_openings(demonstrations, views)
     found += check_fingers(demonstrations, views) + check_direction(demonstrations, views)
-    displaced, depth_shift = check_depth_shift(views)
+    displaced, depth_shift = check_depth_shift(views, edges)
     found += displaced + check_agreement(views, edges)
     spread = scene_spread(views)
     if len(views) > 1 and np.isfinite(spread) and spread < ONE_SCENE_M:
