@@ -41,7 +41,7 @@ from robust_instant_policy.errors import InvalidValueError, KeypointError, Plann
 from robust_instant_policy.evaluation.statistics import auroc, wilson_interval
 from robust_instant_policy.policies import RobustInstantPolicy
 from robust_instant_policy.policies.confidence import COEFFICIENTS, GOOD_AGREEMENT, Evidence, plan_confidence
-from robust_instant_policy.policies.context import locate
+from robust_instant_policy.policies.context import Context, locate
 from robust_instant_policy.sanity import SetReport, errors
 from robust_instant_policy.tasks import TASK_NAMES, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
@@ -96,11 +96,12 @@ def run(options: argparse.Namespace) -> None:
                 split: demonstrations(options.out / "data" / f"{name}-{split}", task, SPLITS[split][0])
                 for split in options.splits
             }
+            sound: dict[tuple[str, str], Context] = {}
             for split, fault, camera in track(cases(options, name), description=name):
                 wanted = range(options.scenes * (options.sound if fault == "none" else 1))
                 left = [index for index in wanted if (name, split, fault, camera, index, options.spread) not in done]
                 if left:
-                    for row in examine(task, shown[split], split, fault, camera, left, options.spread):
+                    for row in examine(task, shown[split], split, fault, camera, left, options.spread, sound):
                         keep(rows, row)
         finally:
             task.close()
@@ -111,9 +112,19 @@ def key(row: Row) -> tuple:
 
 
 def examine(
-    task: Any, shown: Sequence[Demonstration], split: str, name: str, camera: str, scenes: Sequence[int], spread: float
+    task: Any,
+    shown: Sequence[Demonstration],
+    split: str,
+    name: str,
+    camera: str,
+    scenes: Sequence[int],
+    spread: float,
+    sound: dict[tuple[str, str], Context],
 ) -> Iterator[Row]:
-    """One row a scene: planned and executed, also where a check refuses that."""
+    """One row a scene: planned and executed, also where a check refuses that.
+
+    ``sound`` keeps the contexts of demonstrations without a fault, by split and camera.
+    """
     fault = FAULTS.get(name, Fault("none", ()))
     noise = CameraNoise() if camera == "noisy" else None
 
@@ -125,7 +136,12 @@ def examine(
     seen = [replace(d, observation=photograph(d.observation, i)) for i, d in enumerate(shown)]
     try:
         with unchecked():
-            policy.fit(seen if fault.demonstrations is None else fault.demonstrations(seen))
+            if fault.demonstrations is not None:
+                policy.fit(fault.demonstrations(seen))
+            elif (split, camera) in sound:
+                policy.fit_context(sound[split, camera])
+            else:
+                sound[split, camera] = policy.fit(seen).context_
     except RipError as error:
         for index in scenes:
             yield {**base, "scene": index, **no_plan("fit", error)}
@@ -221,8 +237,12 @@ def fit(options: argparse.Namespace) -> None:
         for outcome in related
         if outcome["evidence"]
     ]
-    # the other factors of the model are 0 or left as they are
-    known = [row for row in judged_rows if not row[0].errors and row[0].agreement >= GOOD_AGREEMENT]
+    # the other factors of the model are 0 or less than 1
+    known = [
+        row
+        for row in judged_rows
+        if row[0].is_known and not row[0].errors and row[0].agreement >= GOOD_AGREEMENT and not row[0].doubled > 0
+    ]
     names = [name for name in COEFFICIENTS if name != "constant"]
     found = [evidence.features() for evidence, *_ in known]
     features = np.array([[1.0, *(values[name] for name in names), 0.0] for values in found])

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import binary_dilation, label
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.demonstration import Demonstration, Observation
@@ -467,6 +468,22 @@ def twice(o: Observation) -> Observation:
     return o
 
 
+def replaced(o: Observation) -> Observation:
+    """What stands in the middle of what stands above the table is gone, and a red block stands in the upper left."""
+    rows, cols = raised_pixels(o)
+    raised = np.zeros(o.depth.shape, dtype=bool)
+    raised[rows, cols] = True
+    things, _ = label(binary_dilation(raised, iterations=3))
+    middle = np.argmin((rows - np.median(rows)) ** 2 + (cols - np.median(cols)) ** 2)
+    gone = things == things[rows[middle], cols[middle]]
+    rgb, depth = o.rgb.copy(), o.depth.copy()
+    rgb[gone], depth[gone] = np.median(o.rgb[~raised], axis=0), np.median(o.depth[o.depth > 0])
+    height, width = o.depth.shape
+    block = np.s_[height // 10 : height // 5, width // 10 : width // 6]
+    rgb[block], depth[block] = (200, 30, 30), depth[block] - 0.05
+    return replace(o, rgb=rgb, depth=depth)
+
+
 # Faults of a plan.
 
 
@@ -638,6 +655,7 @@ def _faults() -> dict[str, Fault]:
     add("no-depth-at-grasps:demos", ("depth",), demonstrations=lambda ds: list(map(no_depth_at_grasps, ds)))
     add("no-depth-on-a-thing:scene", ("depth",), scene=lambda o, _: no_depth_on_a_thing(o))
     add("twice:scene", ("looks like",), scene=lambda o, _: twice(o))
+    add("replaced:scene", ("recognised",), scene=lambda o, _: replaced(o))
     add("jump-0.8m:plan", ("step", "m from"), plan=plan_points(jump(0.8)))
     add("jump-0.3m:plan", ("step", "m from"), plan=plan_points(jump(0.3)))
     add("turn-179:plan", ("turn",), plan=plan_points(spin(179.0)))

@@ -28,8 +28,8 @@ class StepFrames:
     The numbers of a step are, for each arm: the point between the fingertips, then the gripper point and the first
     fingertip relative to it (millimetres, in the step's frame), and the gripper state. ``jumps`` are those of each arm
     that were demonstrated (`shown_jumps`); none are needed where no frame changes. ``error``, metres, is that with
-    which frames that are fitted to the other demonstrations predict one at the gripper change that they explain worst;
-    NaN for too few demonstrations, or without gripper changes.
+    which frames that are fitted to the other demonstrations predict an arm at the change of its own gripper that they
+    explain worst; NaN for too few demonstrations, or without gripper changes.
     """
 
     arms: tuple[tuple[Frame, ...], ...]
@@ -57,8 +57,15 @@ class StepFrames:
         scene, hands = locate([WORLD, *things], keypoints), hands_of(actions)
         arms = [hands[:, :, arm] for arm in range(hands.shape[2])]
         frames = tuple(tuple(choose_frames(things, scene, own, key_steps, second)) for own in arms)
-        between = list(key_steps)[1:-1] if len(hands) >= DEMOS_TO_TELL_THINGS else []
-        error = max((own[step].error for own in frames for step in between), default=float("nan"))
+        # an arm may be anywhere while another one grasps: its own changes count
+        closed = actions[0, :, STATE_INDEX::ACTION_DIM].T > 0.5
+        judged = [
+            own[step].error
+            for own, states in zip(frames, closed, strict=True)
+            for step in list(key_steps)[1:-1]
+            if states[step - 1] != states[step] or states[step] != states[step + 1]
+        ]
+        error = max(judged, default=float("nan")) if len(hands) >= DEMOS_TO_TELL_THINGS else float("nan")
         return cls(frames, ranking, tuple(map(shown_jumps, arms)), error)
 
     @property

@@ -10,12 +10,11 @@ from numpy.typing import ArrayLike
 from robust_instant_policy.errors import InvalidValueError, PlanningError
 from robust_instant_policy.policies.confidence import (
     Evidence,
+    count,
     distortion,
-    doubts,
     novelty,
     plan_confidence,
     prediction,
-    undecided,
 )
 from robust_instant_policy.policies.context import Context, LocatedScene
 from robust_instant_policy.policies.policy import FrameUse, Plan, Stage, Stopwatch, Usage
@@ -92,27 +91,22 @@ def make_plan(
     trajectory = Trajectory(chosen.actions, chosen.times)
     outside = context.report.envelope.check(trajectory) if context.report.envelope is not None else ()
     findings = (*context.report.findings, *scene.findings, *outside)
-    best, worst = prediction(context.prediction_errors)
+    doubts, warnings = count(findings)
     frames = context.prompt.for_scene(scene.keypoints).frames
     evidence = Evidence(
         agreement=chosen.confidence,
         vote=context.prompt.vote(scene.keypoints),
+        doubled=len(scene.located.doubled),
         distortion=distortion(context.keypoints, scene.keypoints),
-        prediction=best,
+        prediction=prediction(context.prediction_errors),
+        frames=frames.error,
         novelty=novelty(context.keypoints, scene.keypoints),
         displacement=context.surroundings.displacement(scene.view, chosen.actions) if scene.view else float("nan"),
         precision=context.surroundings.precision,
-        doubts=doubts(findings),
-        warnings=sum(finding.severity == "warning" for finding in findings) - doubts(findings),
+        doubts=doubts,
+        warnings=warnings,
         errors=len(errors(findings)),
-        undecided=undecided(findings),
-        doubled=len(scene.located.doubled),
-        unexplained=worst,
-        frames=frames.error,
-        recognition=scene.recognition,
     )
-    unknown = evidence.unknown_notes if judged else ()
-    beside = (evidence.displacement_note,) if evidence.features()["displacement"] else ()
     return Plan(
         trajectory=trajectory,
         candidates=proposal.candidates,
@@ -136,7 +130,6 @@ def make_plan(
             *context.prompt.scene_notes(scene.keypoints),
             *proposal.notes,
             *map(str, outside),
-            *beside,
-            *unknown,
+            *(evidence.notes if judged else ()),
         ),
     )

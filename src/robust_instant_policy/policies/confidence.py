@@ -1,12 +1,11 @@
 """The confidence of a plan: a calibrated probability that it is right.
 
-    P(right) = min(1, agreement / GOOD_AGREEMENT) · (1 + vote) / 2 · sigmoid(b_0 + Σ_j b_j f_j),   f_j <= 0
+    P(right) = min(1, agreement / GOOD_AGREEMENT) · (1 + vote) / 2 · 2^-doubled · sigmoid(b_0 + Σ_j b_j f_j),   f_j <= 0
 
 The features f_j are made from `Evidence` and are 0 where nothing speaks against the plan; the coefficients were fitted
 to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A
-plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, do not
-predict each other, a thing has another shape than theirs, or the checks could not decide whether images and paths
-belong together, or which of two things is meant, or doubt the recording, it is multiplied by `UNKNOWN`.
+plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, it is
+multiplied by `UNKNOWN`.
 """
 
 from __future__ import annotations
@@ -23,35 +22,25 @@ from robust_instant_policy.geometry import FloatArray, robust_std
 from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
-    "constant": 3.85, "distortion": 1.66, "prediction": 1.88, "novelty": 1.08, "displacement": 1.34,
-    "precision": 1.03, "frames": 1.35, "doubts": 1.0, "warnings": 1.48,
+    "constant": 2.58, "distortion": 1.78, "prediction": 0.85, "novelty": 0.91, "displacement": 1.24,
+    "precision": 0.81, "frames": 0.78, "doubts": 2.16, "warnings": 0.28,
 }  # fmt: skip
 UNKNOWN = 0.5  # factor, and so the most that is claimed, where the demonstrations cannot tell
-
 UNKNOWN_NOTE = (
     "unchecked: the demonstrations cannot tell how well they predict a new scene (fewer than three, or all of one "
     f"scene); the confidence is at most {UNKNOWN}"
 )
-
-UNDECIDED_NOTE = (
-    "unchecked: it could not be decided whether images, camera and paths belong together, or depth is missing; "
-    f"the confidence is at most {UNKNOWN}"
-)
-
-DOUBLED_NOTE = (
-    f"unchecked: it is not known which of two things of one look is meant; the confidence is at most {UNKNOWN}"
-)
-
-DOUBTED_NOTE = (
-    "unchecked: gripper states, grasps or rotations seem to be recorded wrongly, as a warning says; "
-    f"the confidence is at most {UNKNOWN}"
-)
-
-UNRECOGNISED_NOTE = f"unchecked: the scene was hardly recognised; the confidence is at most {UNKNOWN}"
-
-DISTORTED = 3.0  # `Evidence.distortion` above which a thing is another one than was demonstrated, or found wrongly
-
-UNEXPLAINED_M = 0.06  # `Evidence.unexplained` or `frames` above which what demonstrations have in common is not known
+# What each feature says, of values in millimetres where the evidence is in metres.
+WORDS = {
+    "distortion": "the keypoints of a thing lie {:.1f} times farther from its demonstrated shape than usual",
+    "prediction": "the demonstrations predict each other to {:.0f} mm at best",
+    "novelty": "the squared distance of the keypoints from the demonstrations is {:.1f} times their largest",
+    "displacement": "around the planned gripper the image shows what lies {:.0f} mm beside it in the demonstrations",
+    "precision": "what lies around the gripper repeats to {:.0f} mm in the demonstrations",
+    "frames": "at a gripper change the demonstrations predict each other to {:.0f} mm",
+    "doubts": "{:.0f} warnings doubt gripper states, grasps or rotations",
+    "warnings": "there are {:.0f} warnings",
+}
 
 RECOGNISED = 0.7  # of the least confidence in demonstrations, from which on a scene counts as recognised
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
@@ -65,12 +54,8 @@ LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one
 NOISE_M = 0.02  # variation of a coordinate below which it says nothing about a scene
 RIGID_M = 0.010  # variation of the distance of two keypoints below which they belong to one rigid thing
 DISTANCE_M = 0.003  # with which a distance between keypoints is measured
-# Kinds of findings: that doubt the recording, and that leave open whether images and paths belong together.
-RECORDING = {"gripper state", "grasp", "rotation"}
-UNDECIDED = {
-    "warning": {"contact", "hole", "registration", "colour and depth", "scenery", "table"},
-    "unchecked": {"contact", "scenery"},
-}
+RECORDING = {"gripper state", "grasp", "rotation"}  # kinds of findings that doubt the recording
+UNDECIDED = {"contact", "scenery"}  # that leave open whether images and paths belong together where they are unchecked
 MIN_SCENES = 3  # below which nothing is known of their variation
 
 
@@ -79,63 +64,41 @@ class Evidence:
     """What speaks for or against a plan. NaN is unknown.
 
     ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``vote`` in [0, 1] for the way to act
-    that was followed, 0 where either of two may be meant (`Prompt.vote`); ``distortion`` of the distances between
-    keypoints (see `distortion`); ``prediction``, metres, the error with which demonstrations predict each other at the
-    key step at which they do so best, and ``unexplained``, that at which they do so worst; ``frames``, metres, that of
-    frames that are fitted to the others alone (`StepFrames.error`); ``novelty``, how far the scene lies from the
-    demonstrations (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and
-    ``precision``, that of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording
-    (`doubts`), other ``warnings``, and ``errors``, and how many leave open whether images and paths belong together
-    (`undecided`); how many objects with keypoints are ``doubled``: it is not known which is meant;
-    ``recognition`` in [0, 1] of the scene (`recognition`), below 1 where it was hardly recognised.
+    that was followed, 0 where either of two may be meant (`Prompt.vote`); how many objects with keypoints are
+    ``doubled``: of two alike, it is not known which is meant; ``distortion`` of the distances between keypoints (see
+    `distortion`); ``prediction``, metres, the error with which demonstrations predict each other at the key step at
+    which they do so best; ``frames``, metres, that of frames that are fitted to the others alone at the gripper change
+    at which they do so worst (`StepFrames.error`); ``novelty``, how far the scene lies from the demonstrations (see
+    `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and ``precision``, that of
+    the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording, other ``warnings``
+    (`count`), and ``errors``.
     """
 
     agreement: float
     vote: float
+    doubled: int
     distortion: float
     prediction: float
+    frames: float
     novelty: float
     displacement: float
     precision: float
     doubts: int
     warnings: int
     errors: int
-    undecided: int = 0
-    doubled: int = 0
-    unexplained: float = float("nan")
-    frames: float = float("nan")
-    recognition: float = float("nan")
 
     @property
-    def unknown_notes(self) -> tuple[str, ...]:
-        """Why nothing is known of the plan's chance; empty where something is."""
-        distorted = (
-            f"warning: the keypoints of a thing lie {self.distortion:.1f} times farther from its demonstrated shape "
-            f"than usual ({DISTORTED:.0f} are accepted): is it another thing? the confidence is at most {UNKNOWN}"
-        )
-        worst = float(np.fmax(self.unexplained, self.frames))
-        unexplained = (
-            "warning: at a gripper change the demonstrations predict each other only to "
-            f"{worst * 1e3:.0f} mm ({UNEXPLAINED_M * 1e3:.0f} mm are accepted): what they have in common "
-            f"there was not found; the confidence is at most {UNKNOWN}"
-        )
-        reasons = {
-            UNKNOWN_NOTE: not (np.isfinite(self.prediction) and np.isfinite(self.novelty)),
-            UNDECIDED_NOTE: self.undecided > 0,
-            DOUBLED_NOTE: self.doubled > 0,
-            DOUBTED_NOTE: self.doubts > 0,
-            UNRECOGNISED_NOTE: self.recognition < 1,
-            distorted: self.distortion > DISTORTED,
-            unexplained: worst > UNEXPLAINED_M,
-        }
-        return tuple(note for note, holds in reasons.items() if holds)
+    def is_known(self) -> bool:
+        """Whether demonstrations tell how well they predict a new scene."""
+        return bool(np.isfinite(self.prediction) and np.isfinite(self.novelty))
 
     @property
-    def displacement_note(self) -> str:
-        return (
-            f"warning: around the planned gripper the image shows what lies {self.displacement * 1e3:.0f} mm beside it "
-            f"in the demonstrations (theirs differ by {self.precision * 1e3:.0f} mm): were the keypoints found rightly?"
-        )
+    def notes(self) -> tuple[str, ...]:
+        """What lowers the confidence, for the user."""
+        against = [name for name, value in self.features().items() if value < 0]
+        told = [WORDS[name].format(getattr(self, name) * (1e3 if "mm" in WORDS[name] else 1)) for name in against]
+        lowered = (f"warning: the confidence is lowered: {'; '.join(told)}",) if told else ()
+        return (*lowered, *(() if self.is_known else (UNKNOWN_NOTE,)))
 
     def features(self) -> Mapping[str, float]:
         """f_j by name; 0 for what is not known."""
@@ -158,32 +121,25 @@ def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEF
         return 0.0
     score = coefficients["constant"] + sum(coefficients[name] * value for name, value in evidence.features().items())
     agreement, vote = np.nan_to_num(evidence.agreement), np.nan_to_num(evidence.vote, nan=1.0)
-    probability = float(min(1.0, agreement / GOOD_AGREEMENT) * (1 + vote) / 2 * expit(score))
-    return UNKNOWN * probability if evidence.unknown_notes else probability
+    likely = min(1.0, agreement / GOOD_AGREEMENT) * (1 + vote) / 2 * 0.5 ** np.nan_to_num(evidence.doubled)
+    return float(likely * expit(score) * (1.0 if evidence.is_known else UNKNOWN))
 
 
-def doubts(findings: Sequence[Finding]) -> int:
-    """How many ``findings`` are warnings that gripper states, grasps or rotations were recorded wrongly."""
-    return sum(f.severity == "warning" and f.kind in RECORDING and bool(f.cause) for f in findings)
+def count(findings: Sequence[Finding]) -> tuple[int, int]:
+    """How many ``findings`` are warnings that gripper states, grasps or rotations were recorded wrongly, and how many
+    are others, or leave open whether images and paths belong together."""
+    warnings = sum(f.severity == "warning" or (f.severity == "unchecked" and f.kind in UNDECIDED) for f in findings)
+    doubts = sum(f.severity == "warning" and f.kind in RECORDING and bool(f.cause) for f in findings)
+    return doubts, warnings - doubts
 
 
-def undecided(findings: Sequence[Finding]) -> int:
-    """How many ``findings`` say that it is open whether images, camera and paths belong together, or that depth is
-    missing where a thing may be."""
-    return sum(f.kind in UNDECIDED.get(f.severity, ()) for f in findings)
+def prediction(errors: FloatArray) -> float:
+    """Metres, from the errors ``(I, S)`` of `leave_one_out`: the median over the demonstrations at the best key step.
 
-
-def prediction(errors: FloatArray) -> tuple[float, float]:
-    """Metres, from the errors ``(I, S)`` of `leave_one_out`: the median over the demonstrations at the best and at the
-    worst key step.
-
-    The best tells how precise demonstrators are where the gripper meets a thing; elsewhere they vary more, within
-    limits. The first and the last step count only where there are no others; the worst is then unknown, NaN.
+    It tells how precise demonstrators are where the gripper meets a thing; elsewhere they vary more, within limits. The
+    first and the last step count only where there are no others.
     """
-    if errors.shape[1] <= 2:
-        return float(np.median(errors, axis=0).min()), float("nan")
-    between = np.median(errors[:, 1:-1], axis=0)
-    return float(between.min()), float(between.max())
+    return float(np.median(errors[:, 1:-1] if errors.shape[1] > 2 else errors, axis=0).min())
 
 
 def novelty(demonstrated: FloatArray, keypoints: FloatArray) -> float:
