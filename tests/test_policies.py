@@ -206,13 +206,12 @@ SURE = Evidence(
     vote=1.0,
     doubled=0,
     distortion=0.5,
-    prediction=0.008,
     frames=0.008,
+    prediction=0.008,
     novelty=0.4,
     displacement=0.004,
     precision=0.004,
     doubts=0,
-    warnings=0,
     errors=0,
 )
 
@@ -224,14 +223,11 @@ SURE = Evidence(
         {"vote": 0.5},
         {"doubled": 1},
         {"distortion": 2.9},
-        {"prediction": 0.05},
+        {"frames": np.nan, "prediction": 0.05},
         {"frames": 0.05},
         {"novelty": 4.0},
         {"displacement": 0.04},
-        {"precision": 0.04},
-        {"precision": np.inf},
         {"doubts": 1},
-        {"warnings": 2},
     ],
     ids=str,
 )
@@ -254,8 +250,9 @@ def test_what_cannot_be_known_bounds_the_confidence(unknown):
 
 
 def test_notes_say_what_lowers_the_confidence():
-    (note,) = replace(SURE, frames=0.05, warnings=2).notes
-    assert "demonstrations predict each other to 50 mm; there are 2 warnings" in note
+    (note,) = replace(SURE, frames=0.05, displacement=0.03).notes
+    assert "demonstrations predict each other to 50 mm; around the planned gripper" in note
+    assert "30 mm beside it" in note
 
 
 def test_demonstrations_are_judged_at_the_key_step_that_they_predict_best():

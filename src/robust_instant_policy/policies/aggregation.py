@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from robust_instant_policy.errors import InvalidValueError, PlanningError
 from robust_instant_policy.policies.confidence import (
     Evidence,
-    count,
     distortion,
+    doubts,
     novelty,
     plan_confidence,
     prediction,
@@ -91,20 +91,18 @@ def make_plan(
     trajectory = Trajectory(chosen.actions, chosen.times)
     outside = context.report.envelope.check(trajectory) if context.report.envelope is not None else ()
     findings = (*context.report.findings, *scene.findings, *outside)
-    doubts, warnings = count(findings)
     frames = context.prompt.for_scene(scene.keypoints).frames
     evidence = Evidence(
         agreement=chosen.confidence,
         vote=context.prompt.vote(scene.keypoints),
         doubled=len(scene.located.doubled),
         distortion=distortion(context.keypoints, scene.keypoints),
-        prediction=prediction(context.prediction_errors),
         frames=frames.error,
+        prediction=prediction(context.prediction_errors),
         novelty=novelty(context.keypoints, scene.keypoints),
         displacement=context.surroundings.displacement(scene.view, chosen.actions) if scene.view else float("nan"),
         precision=context.surroundings.precision,
-        doubts=doubts,
-        warnings=warnings,
+        doubts=doubts(findings),
         errors=len(errors(findings)),
     )
     return Plan(

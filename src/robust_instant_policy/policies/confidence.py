@@ -22,40 +22,34 @@ from robust_instant_policy.geometry import FloatArray, robust_std
 from robust_instant_policy.sanity import Finding
 
 COEFFICIENTS = {
-    "constant": 2.58, "distortion": 1.78, "prediction": 0.85, "novelty": 0.91, "displacement": 1.24,
-    "precision": 0.81, "frames": 0.78, "doubts": 2.16, "warnings": 0.28,
+    "constant": 2.84, "distortion": 1.82, "frames": 1.59, "novelty": 0.99, "displacement": 1.14, "doubts": 2.59,
 }  # fmt: skip
 UNKNOWN = 0.5  # factor, and so the most that is claimed, where the demonstrations cannot tell
 UNKNOWN_NOTE = (
     "unchecked: the demonstrations cannot tell how well they predict a new scene (fewer than three, or all of one "
     f"scene); the confidence is at most {UNKNOWN}"
 )
-# What each feature says, of values in millimetres where the evidence is in metres.
 WORDS = {
-    "distortion": "the keypoints of a thing lie {:.1f} times farther from its demonstrated shape than usual",
-    "prediction": "the demonstrations predict each other to {:.0f} mm at best",
-    "novelty": "the squared distance of the keypoints from the demonstrations is {:.1f} times their largest",
-    "displacement": "around the planned gripper the image shows what lies {:.0f} mm beside it in the demonstrations",
-    "precision": "what lies around the gripper repeats to {:.0f} mm in the demonstrations",
-    "frames": "at a gripper change the demonstrations predict each other to {:.0f} mm",
-    "doubts": "{:.0f} warnings doubt gripper states, grasps or rotations",
-    "warnings": "there are {:.0f} warnings",
+    "distortion": "the keypoints of a thing lie {distortion:.1f} times farther from its demonstrated shape than usual",
+    "frames": "where it matters most the demonstrations predict each other to {frames_mm:.0f} mm",
+    "novelty": "the squared distance of the keypoints from the demonstrations is {novelty:.1f} times their largest",
+    "displacement": "around the planned gripper the image shows what lies {displacement_mm:.0f} mm beside it in the "
+    "demonstrations (theirs differ by {precision_mm:.0f} mm)",
+    "doubts": "gripper states, grasps or rotations seem to be recorded wrongly",
 }
+"""What each feature says."""
 
 RECOGNISED = 0.7  # of the least confidence in demonstrations, from which on a scene counts as recognised
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
 # Up to these values evidence says nothing: sound scenes have them.
 GOOD_DISTORTION = 2.0
-GOOD_PREDICTION_M = 0.015
+GOOD_FRAMES_M, GOOD_PREDICTION_M = 0.010, 0.015
 GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT = 0.015, 1.5  # or that many times the demonstrations' own
-GOOD_PRECISION_M = 0.025
-GOOD_FRAMES_M = 0.010
 LEAST_SPREAD_M = 0.005  # demonstrations whose keypoints differ by less show one scene
 NOISE_M = 0.02  # variation of a coordinate below which it says nothing about a scene
 RIGID_M = 0.010  # variation of the distance of two keypoints below which they belong to one rigid thing
 DISTANCE_M = 0.003  # with which a distance between keypoints is measured
 RECORDING = {"gripper state", "grasp", "rotation"}  # kinds of findings that doubt the recording
-UNDECIDED = {"contact", "scenery"}  # that leave open whether images and paths belong together where they are unchecked
 MIN_SCENES = 3  # below which nothing is known of their variation
 
 
@@ -66,25 +60,24 @@ class Evidence:
     ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``vote`` in [0, 1] for the way to act
     that was followed, 0 where either of two may be meant (`Prompt.vote`); how many objects with keypoints are
     ``doubled``: of two alike, it is not known which is meant; ``distortion`` of the distances between keypoints (see
-    `distortion`); ``prediction``, metres, the error with which demonstrations predict each other at the key step at
-    which they do so best; ``frames``, metres, that of frames that are fitted to the others alone at the gripper change
-    at which they do so worst (`StepFrames.error`); ``novelty``, how far the scene lies from the demonstrations (see
-    `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and ``precision``, that of
-    the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording, other ``warnings``
-    (`count`), and ``errors``.
+    `distortion`); ``frames``, metres, the error with which frames that are fitted to the other demonstrations predict
+    one at the gripper change at which they do so worst (`StepFrames.error`), and ``prediction``, that of the
+    demonstrations at the key step at which they predict each other best, which stands in for it without gripper
+    changes; ``novelty``, how far the scene lies from the demonstrations (see `novelty`); ``displacement``, metres, of
+    the plan against what lies around the gripper, and ``precision``, that of the demonstrations (`Surroundings`); how
+    many findings are ``doubts`` about the recording (`doubts`), and ``errors``.
     """
 
     agreement: float
     vote: float
     doubled: int
     distortion: float
-    prediction: float
     frames: float
+    prediction: float
     novelty: float
     displacement: float
     precision: float
     doubts: int
-    warnings: int
     errors: int
 
     @property
@@ -95,24 +88,28 @@ class Evidence:
     @property
     def notes(self) -> tuple[str, ...]:
         """What lowers the confidence, for the user."""
-        against = [name for name, value in self.features().items() if value < 0]
-        told = [WORDS[name].format(getattr(self, name) * (1e3 if "mm" in WORDS[name] else 1)) for name in against]
-        lowered = (f"warning: the confidence is lowered: {'; '.join(told)}",) if told else ()
+        values = {
+            **vars(self),
+            "frames_mm": 1e3 * (self.prediction if np.isnan(self.frames) else self.frames),
+            "displacement_mm": 1e3 * self.displacement,
+            "precision_mm": 1e3 * self.precision,
+        }
+        told = "; ".join(WORDS[name].format(**values) for name, value in self.features().items() if value < 0)
+        lowered = (f"warning: the confidence is lowered: {told}",) if told else ()
         return (*lowered, *(() if self.is_known else (UNKNOWN_NOTE,)))
 
     def features(self) -> Mapping[str, float]:
         """f_j by name; 0 for what is not known."""
-        found = {
+        usual = max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision)))
+        ratios = {
             "distortion": self.distortion / GOOD_DISTORTION,
-            "prediction": self.prediction / GOOD_PREDICTION_M,
+            "frames": self.prediction / GOOD_PREDICTION_M if np.isnan(self.frames) else self.frames / GOOD_FRAMES_M,
             "novelty": self.novelty,
-            "displacement": self.displacement
-            / max(GOOD_DISPLACEMENT_M, GOOD_DISPLACEMENT * float(np.nan_to_num(self.precision))),
-            "precision": self.precision / GOOD_PRECISION_M,
-            "frames": self.frames / GOOD_FRAMES_M,
+            "displacement": self.displacement / usual,
         }
-        ratios = {name: -float(np.log(max(ratio, 1.0))) for name, ratio in found.items() if not np.isnan(ratio)}
-        return {**dict.fromkeys(found, 0.0), **ratios, "doubts": -float(self.doubts), "warnings": -float(self.warnings)}
+        return {name: -float(np.log(np.fmax(ratio, 1.0))) for name, ratio in ratios.items()} | {
+            "doubts": -float(self.doubts)
+        }
 
 
 def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEFFICIENTS) -> float:
@@ -125,12 +122,9 @@ def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEF
     return float(likely * expit(score) * (1.0 if evidence.is_known else UNKNOWN))
 
 
-def count(findings: Sequence[Finding]) -> tuple[int, int]:
-    """How many ``findings`` are warnings that gripper states, grasps or rotations were recorded wrongly, and how many
-    are others, or leave open whether images and paths belong together."""
-    warnings = sum(f.severity == "warning" or (f.severity == "unchecked" and f.kind in UNDECIDED) for f in findings)
-    doubts = sum(f.severity == "warning" and f.kind in RECORDING and bool(f.cause) for f in findings)
-    return doubts, warnings - doubts
+def doubts(findings: Sequence[Finding]) -> int:
+    """How many ``findings`` are warnings that gripper states, grasps or rotations were recorded wrongly."""
+    return sum(f.severity == "warning" and f.kind in RECORDING and bool(f.cause) for f in findings)
 
 
 def prediction(errors: FloatArray) -> float:

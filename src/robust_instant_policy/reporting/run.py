@@ -226,14 +226,13 @@ def _candidate_table(plan: Plan) -> Table:
 
 EVIDENCE: dict[str, tuple[str, Callable[[float], str]]] = {
     "agreement": ("agreement of the candidates", lambda value: f"{value:.2f}"),
-    "prediction": ("error with which demonstrations predict each other", lambda value: f"{MM * value:.0f} mm"),
-    "frames": ("the same at a gripper change, of the worst", lambda value: f"{MM * value:.0f} mm"),
+    "frames": ("error with which demonstrations predict a gripper change", lambda value: f"{MM * value:.0f} mm"),
+    "prediction": ("error with which they predict a key step at best", lambda value: f"{MM * value:.0f} mm"),
     "distortion": ("change of distances between keypoints, about 1 is usual", lambda value: f"{value:.1f}"),
     "novelty": ("distance of the scene from the demonstrations, above 1 it lies outside", lambda value: f"{value:.1f}"),
     "displacement": ("displacement against what is around the gripper", lambda value: f"{MM * value:.0f} mm"),
     "precision": ("displacement of demonstrations against each other", lambda value: f"{MM * value:.0f} mm"),
     "doubts": ("doubts whether states, grasps and rotations were recorded rightly", lambda value: f"{value:.0f}"),
-    "warnings": ("other warnings of the checks", lambda value: f"{value:.0f}"),
     "errors": ("errors of the checks", lambda value: f"{value:.0f}"),
 }  # see `policies.confidence.Evidence`
 
