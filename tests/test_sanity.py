@@ -92,6 +92,31 @@ def test_depth_that_is_displaced_against_colour_in_demonstrations_is_told(demons
         assert found.severity == "warning"
 
 
+def raised(o):
+    return o.depth < np.median(o.depth) - 0.012
+
+
+def shadow(o):
+    dark = np.roll(raised(o), (4, 8), axis=(0, 1)) & ~raised(o)
+    return replace(o, rgb=np.where(dark[..., None], o.rgb // 3, o.rgb))
+
+
+def stripes(o):
+    light = (np.arange(o.rgb.shape[1]) // 6 % 2 == 0) & ~raised(o)
+    return replace(o, rgb=np.where(light[..., None], np.minimum(o.rgb, 165) + 90, o.rgb).astype(np.uint8))
+
+
+def occluded(o):
+    hidden = np.roll(raised(o), 6, axis=1) & ~raised(o)
+    return replace(o, depth=np.where(hidden, np.float32("nan"), o.depth))
+
+
+@pytest.mark.parametrize("change", [shadow, stripes, occluded])
+def test_shadows_stripes_and_occlusion_are_no_displacement_of_depth(demonstrations, change):
+    findings = check_demonstrations(with_images(demonstrations[:3], change)).findings
+    assert not [f for f in findings if f.kind == "registration"]
+
+
 def test_depth_that_is_displaced_against_colour_in_a_scene_is_told(report, demonstrations, scene):
     findings = report.require_observation(FAULTS["depth-6px:scene"].scene(scene, demonstrations))
     assert re.search(r"depth is displaced by \+6, \+0 pixels \(1\d mm\)", " ".join(map(str, findings)))

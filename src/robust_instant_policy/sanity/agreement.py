@@ -30,8 +30,6 @@ FAR_SHIFTS = ((0.13, 0.07), (-0.11, 0.17), (0.21, -0.12), (-0.16, -0.19), (0.29,
 REACH = 0.16  # share of the image, of the displacements that are compared
 NEAR_PX = 16  # beyond it a displacement is no fault of a calibration
 ALIGNED_PX = 3.5  # displacement of sound images, where `sound_shift` is not more
-DISTINCT = 1.3  # strength at the peak over the median of all displacements, from which it is one, and
-DISTINCT_DEVIATIONS = 3.0  # deviations over their mean
 LOST = 0.3  # share of the peak's height over the median that is lost at the place where it should be
 CLEARLY = 1.35  # times as strong as by chance: edges agree
 DISTINCT_EDGES = 1.6  # times as strong as by chance, which does not happen by chance in a sound image
@@ -151,17 +149,16 @@ def sound_shift(view: View) -> float:
 
 
 def is_displaced(strength: FloatArray, usual: Shift, tolerance: float) -> bool:
-    """Whether the peak of an `edge_strength` up to `NEAR_PX` stands out and lies by more than ``tolerance``, pixels,
-    beside ``usual``, where much of it is lost."""
+    """Whether the peak of an `edge_strength` up to `NEAR_PX` lies by more than ``tolerance``, pixels, beside ``usual``,
+    where much of it is lost."""
     near = _near(strength)
     col, row = depth_shift(near)
     if np.hypot(col - usual[0], row - usual[1]) <= tolerance or _is_at_border(near):
         return False
-    middle, peak = float(np.median(near)), float(near.max())
-    distinct = peak > max(ALONG, DISTINCT * middle, near.mean() + DISTINCT_DEVIATIONS * near.std())
+    peak = float(near.max())
     first_row, first_col = (max(NEAR_PX + by - 1, 0) for by in (usual[1], usual[0]))
     there = float(near[first_row : first_row + 3, first_col : first_col + 3].max())
-    return bool(distinct and peak - there > LOST * (peak - middle))
+    return peak > ALONG and peak - there > LOST * (peak - float(np.median(near)))
 
 
 def check_depth_shift(views: Sequence[View], found: Sequence[Agreement]) -> tuple[list[Finding], Shift]:
