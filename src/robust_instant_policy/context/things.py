@@ -13,7 +13,14 @@ from scipy.optimize import least_squares
 from scipy.spatial.distance import squareform
 from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.geometry import FloatArray, fit_rigid, fit_upright, robust_std, rotations_about_vertical
+from robust_instant_policy.geometry import (
+    FloatArray,
+    fit_rigid,
+    fit_upright,
+    robust_std,
+    rotations_about_vertical,
+    transform_points,
+)
 
 RIGID_SPREADS = 3.5  # keypoints whose distance varies by so many times the smallest variation belong to the same thing,
 RIGID_SPREAD_M = (0.006, 0.015)  # within these limits
@@ -315,11 +322,11 @@ def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArr
         return fit(np.broadcast_to(shape, points.shape), points, np.ones(points.shape[:2]))
     subsets = np.array(list(combinations(range(len(shape)), size)))
     starts = fit(shape[subsets], points[:, subsets], np.ones((len(points), *subsets.shape)))  # (I, subsets, 4, 4)
-    loss = _squared(_moved(starts, shape) - points[:, None])
+    loss = _squared(transform_points(starts, shape) - points[:, None])
     best = np.argmin((loss / (loss + OUTLIER_M**2)).sum(axis=-1), axis=1)
     pose = starts[np.arange(len(points)), best]
     for _ in range(5):
-        residual = _squared(_moved(pose, shape) - points)
+        residual = _squared(transform_points(pose, shape) - points)
         pose = fit(np.broadcast_to(shape, points.shape), points, 1 / (1 + residual / OUTLIER_M**2) ** 2)
     return pose
 
@@ -359,14 +366,10 @@ def _fit_either_hand(
     """
     shapes = [shape, shape * MIRROR] if mirrors else [shape]
     fits = np.stack([robust_fit(own, points, upright) for own in shapes])
-    fitted = np.stack([_moved(poses, own) for poses, own in zip(fits, shapes, strict=True)])
+    fitted = np.stack([transform_points(poses, own) for poses, own in zip(fits, shapes, strict=True)])
     off = np.sqrt(_squared(fitted - points).mean(axis=-1))
     best = off.argmin(axis=0)
     return fits[best, np.arange(len(points))], 1.0 - 2.0 * best, off
-
-
-def _moved(poses: FloatArray, points: FloatArray) -> FloatArray:
-    return points @ np.swapaxes(poses[..., :3, :3], -1, -2) + poses[..., None, :3, 3]
 
 
 def _squared(vectors: FloatArray) -> FloatArray:

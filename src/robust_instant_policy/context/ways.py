@@ -18,7 +18,7 @@ import numpy as np
 
 from robust_instant_policy.context.choice import NOISE_M, UNEXPLAINED_M, Candidates, prediction_errors
 from robust_instant_policy.context.things import MAX_THINGS, WORLD, Located, Scene, Thing, find_things, locate
-from robust_instant_policy.geometry import FloatArray, fit_upright
+from robust_instant_policy.geometry import FloatArray, fit_upright, transform_points
 
 RANK_GAIN, SPLIT_GAIN = 1.0, 1.0  # sums of logarithms of the errors at key steps by which an explanation must be better
 MAX_SPLITS = 40  # ways to part the demonstrations that are tried, those with the widest gaps
@@ -252,8 +252,7 @@ def _matched(shape: FloatArray | None, other: FloatArray | None) -> tuple[int, .
     orders = np.array(list(permutations(range(len(shape)))))
     moved = other[orders]  # (orders, N, 3)
     poses = fit_upright(moved, np.broadcast_to(shape, moved.shape), np.ones(moved.shape[:2]))
-    fitted = moved @ np.swapaxes(poses[:, :3, :3], -1, -2) + poses[:, None, :3, 3]
-    difference = np.linalg.norm(fitted - shape, axis=-1).max(axis=1)
+    difference = np.linalg.norm(transform_points(poses, moved) - shape, axis=-1).max(axis=1)
     best = int(np.argmin(difference))
     return tuple(map(int, orders[best])) if difference[best] < ALIKE_M else None
 

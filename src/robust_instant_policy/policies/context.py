@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robust_instant_policy.context import Prompt, leave_one_out, write_prompt
-from robust_instant_policy.context.alignment import align
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
@@ -130,8 +129,7 @@ def _context(
     """What keypoints, trajectories and, where there are any, ``observations`` of demonstrations give."""
     thinned = tuple(downsample(one, settings.downsampling, settings.num_steps) for one in trajectories)
     prompt = write_prompt(keypoints, thinned, settings.frames, settings.layout)
-    aligned = align(thinned)
-    views = [View.of(observations[index]) for index in aligned.kept] if observations else []
+    views = [View.of(observations[index]) for index in prompt.aligned.kept] if observations else []
     return Context(
         (),
         None,
@@ -140,8 +138,8 @@ def _context(
         thinned,
         prompt,
         SetReport((), Envelope.of(trajectories, HORIZONTAL), None),
-        Surroundings.of(views, aligned.actions),
-        leave_one_out(keypoints, thinned, prompt),
+        Surroundings.of(views, prompt.aligned.actions),
+        leave_one_out(prompt),
         prompt.notes(),
     )
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.checks import checked_positive, is_finite
+from robust_instant_policy.context.frames import FrameUse
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError, KeypointError, PlanningError
@@ -87,18 +88,6 @@ class Stopwatch:
         start = time.perf_counter()
         yield
         self.stages.append(Stage(name, time.perf_counter() - start))
-
-
-@dataclass(frozen=True, eq=False)
-class FrameUse:
-    """A frame in which the steps ``first`` to ``last`` of an arm were planned, in ``words``, and the last step's pose
-    ``(4, 4)``."""
-
-    words: str
-    arm: int
-    first: int
-    last: int
-    pose: FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from robust_instant_policy.context.alignment import align
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.aggregation import take_first
 from robust_instant_policy.policies.context import Context, LocatedScene
@@ -58,7 +57,7 @@ class KeypointDiffusion(KeypointPolicy):
         """Load the weights that belong to the demonstrations, or train them; returns itself."""
         super().fit_context(context)
         demonstrations = context.demonstrations
-        aligned = align(context.trajectories)
+        aligned = context.prompt.aligned
         keypoints = context.keypoints[list(aligned.kept)].reshape(len(aligned.kept), -1)
         actions = aligned.actions
         self._keypoints, self._actions = keypoints, actions
