@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 from numpy.typing import ArrayLike
 
-from robust_instant_policy.checks import checked_positive, checked_whole
+from robust_instant_policy.checks import check_name, checked_positive, checked_whole
 from robust_instant_policy.context import Frames, Layout
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError, UsageError
 from robust_instant_policy.geometry import as_numbers
@@ -90,8 +90,7 @@ class Settings:
         their Table II, "paper-real" the same with the columns "Real": DINO keypoints by nearest neighbours, whole
         trajectories in the world frame in one prompt, and the mean of the networks.
         """
-        if config not in CONFIGS:
-            raise UnknownNameError("config", config, tuple(CONFIGS))
+        check_name("config", config, CONFIGS)
         return cls(**CONFIGS[config])
 
     @property

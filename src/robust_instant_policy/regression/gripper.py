@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robust_instant_policy.checks import checked_array, checked_positive, checked_whole
-from robust_instant_policy.errors import InvalidValueError, UnknownNameError
+from robust_instant_policy.checks import check_name, checked_array, checked_positive, checked_whole
+from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.regression.candidates import Candidates, group_matrix
 from robust_instant_policy.regression.diagnosis import judge, scaled_residuals
@@ -83,8 +83,7 @@ def robust_gripper_trajectory(
     by less is not called hallucinated. The trajectory does not depend on it. ``bends`` is the old name of curvature.
     """
     dof, seed = checked_positive("dof", dof, infinite=True), checked_whole("seed", seed)
-    if estimator not in ESTIMATORS:
-        raise UnknownNameError("estimator", estimator, ESTIMATORS)
+    check_name("estimator", estimator, ESTIMATORS)
     tolerance, expected = checked_positive("tolerance", tolerance), checked_curvature(curvature, bends)
     usual = None if variation is None else _checked_variation(variation)
     if not isinstance(triangle, GripperTriangle | None):

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.errors import UnknownNameError
+from robust_instant_policy.checks import check_name
 from robust_instant_policy.geometry import FloatArray, make_pose, transform_points
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 from robust_instant_policy.tasks.textures import Color
@@ -62,12 +62,12 @@ PAPER = Level("paper")
 HARD = Level("hard", CameraNoise(), np.pi, (2, 5), furnishing=True, hides=True, start=0.08, objects="unseen")
 NOISE = Level("noise", CameraNoise())
 LEVELS = {level.name: level for level in (PAPER, NOISE, HARD)}
+CAMERA_LEVELS = (PAPER.name, NOISE.name)  # of scenes that a benchmark draws: only the camera varies
 
 
 def make_level(name: str) -> Level:
     """The level called ``name``; raises `UnknownNameError`."""
-    if name not in LEVELS:
-        raise UnknownNameError("level", name, tuple(LEVELS))
+    check_name("level", name, LEVELS)
     return LEVELS[name]
 
 

@@ -27,7 +27,6 @@ from robust_instant_policy.tasks.aloha.robot import (
     HOME_JOINTS,
     PARKED_JOINTS,
     TOOL,
-    site_pose,
     two_arms,
 )
 from robust_instant_policy.tasks.aloha.surfaces import (
@@ -155,7 +154,7 @@ class AlohaEnv(gymnasium.Env):
             self.data.actuator(f"{arm}/{FINGERS[0]}").ctrl = CLOSED_M + travel
         mujoco.mj_step(self.model, self.data, round(SETTLE_SECONDS / TIMESTEP_S))
         mujoco.mj_forward(self.model, self.data)
-        self._joints_before = self._joints()
+        self._joints_before = self.measured()
         return self._observation(), {}
 
     def step(self, action: FloatArray) -> tuple[dict, float, bool, bool, dict]:
@@ -165,7 +164,7 @@ class AlohaEnv(gymnasium.Env):
 
     def advance(self, command: FloatArray) -> None:
         """One control step, with joint angles and finger travel ``(7·A,)`` commanded, without evaluation."""
-        self._joints_before = self._joints()
+        self._joints_before = self.measured()
         for side, (*angles, travel) in zip(self.end_effectors, command.reshape(-1, len(ARM_JOINTS) + 1), strict=True):
             for joint, angle in zip(ARM_JOINTS, angles, strict=True):
                 self.data.actuator(f"{ARMS[side]}/{joint}").ctrl = angle
@@ -200,9 +199,8 @@ class AlohaEnv(gymnasium.Env):
         parts = np.full(seen.shape[:2], -1)
         geoms = seen[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
         parts[geoms] = self.model.geom_bodyid[seen[..., 0][geoms]]
-        bodies = range(self.model.nbody)
-        poses = [make_pose(self.data.xmat[body].reshape(3, 3), self.data.xpos[body]) for body in bodies]
-        return SceneTruth(parts, tuple(self.model.body(body).name for body in bodies), np.array(poses))
+        names = tuple(self.model.body(body).name for body in range(self.model.nbody))
+        return SceneTruth(parts, names, make_pose(self.data.xmat.reshape(-1, 3, 3), self.data.xpos))
 
     def video_frame(self) -> np.ndarray:
         """RGB frame ``(H, W, 3)`` uint8 of the camera beside the table."""
@@ -218,7 +216,8 @@ class AlohaEnv(gymnasium.Env):
 
     def tool_poses(self) -> FloatArray:
         """Poses of the working arms' tool frames, ``(A, 4, 4)``."""
-        return np.stack([site_pose(self.data, f"{ARMS[side]}/{TOOL}") for side in self.end_effectors])
+        tools = [self.data.site(f"{ARMS[side]}/{TOOL}") for side in self.end_effectors]
+        return np.stack([make_pose(tool.xmat.reshape(3, 3), tool.xpos) for tool in tools])
 
     def pose_of(self, body: str) -> FloatArray:
         """Pose of a body, ``(4, 4)``."""
@@ -227,7 +226,7 @@ class AlohaEnv(gymnasium.Env):
 
     def arm_is_still(self) -> bool:
         """Whether no joint of a working arm moved faster than `STILL_RAD_S` over the last control step."""
-        moved = np.abs(self._joints() - self._joints_before).reshape(-1, len(ARM_JOINTS) + 1)[:, : len(ARM_JOINTS)]
+        moved = np.abs(self.measured() - self._joints_before).reshape(-1, len(ARM_JOINTS) + 1)[:, : len(ARM_JOINTS)]
         return bool(moved.max() * CONTROL_HZ <= STILL_RAD_S)
 
     def is_still(self, body: str) -> bool:
@@ -248,16 +247,12 @@ class AlohaEnv(gymnasium.Env):
         """Whether both fingers of the arm on a ``side`` press on a body."""
         return all(self.touch(body, f"{ARMS[side]}/{finger}_link") > HELD_N for finger in FINGERS)
 
-    def measured(self) -> FloatArray:
-        """Joint angles and finger travel of the working arms, ``(7·A,)``."""
-        return self._joints()
-
     def grip_loads(self) -> FloatArray:
         """Force of each working gripper as a share of its limit, ``(A,)``."""
         forces = [self.data.actuator(f"{ARMS[side]}/{FINGERS[0]}").force[0] for side in self.end_effectors]
         return np.abs(forces) / (2 * GRIP_FORCE_N)
 
-    def _joints(self) -> FloatArray:
+    def measured(self) -> FloatArray:
         """Joint angles and finger travel of the working arms, in the order of commands ``(7·A,)``."""
         reached: list[float] = []
         for side in self.end_effectors:
@@ -266,7 +261,7 @@ class AlohaEnv(gymnasium.Env):
         return np.array(reached)
 
     def _observation(self) -> dict[str, np.ndarray]:
-        seen: dict[str, np.ndarray] = {"joints": self._joints().astype(np.float32)}
+        seen: dict[str, np.ndarray] = {"joints": self.measured().astype(np.float32)}
         if self.obs_mode == "rgbd":
             photograph = self.photograph()
             seen |= {"rgb": photograph.rgb, "depth": photograph.depth}

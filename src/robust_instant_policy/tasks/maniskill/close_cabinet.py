@@ -95,7 +95,6 @@ SPEC = TaskSpec(
     name="close-cabinet",
     description="push the cabinet's door closed",
     goal="the cabinet's door is closed",
-    env_id="RIP-CloseCabinet-v1",
     expert=push_closed,
     object_sets=("seen", "unseen"),
     asset_sources=("code", "maniskill"),

@@ -73,7 +73,6 @@ SPEC = TaskSpec(
     name="open-drawer",
     description="pull the drawer open by its handle",
     goal="the drawer is open",
-    env_id="RIP-OpenDrawer-v1",
     expert=pull,
     asset_sources=("code", "maniskill"),
 )

@@ -106,6 +106,5 @@ SPEC = TaskSpec(
     name="push-cube",
     description="push the cube into the goal disc",
     goal="the cube is in the goal disc",
-    env_id="RIP-PushCube-v1",
     expert=push,
 )

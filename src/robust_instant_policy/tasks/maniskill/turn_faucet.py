@@ -86,7 +86,6 @@ SPEC = TaskSpec(
     name="turn-faucet",
     description="turn the faucet's lever",
     goal="the faucet is turned on",
-    env_id="RIP-TurnFaucet-v1",
     expert=turn,
     object_sets=("seen", "unseen"),
     asset_sources=("code", "maniskill"),

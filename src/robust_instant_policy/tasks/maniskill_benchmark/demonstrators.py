@@ -12,7 +12,8 @@ import numpy as np
 
 from robust_instant_policy.geometry import FloatArray, invert_pose, make_pose
 from robust_instant_policy.tasks.demonstrator import Stroke
-from robust_instant_policy.tasks.maniskill_benchmark.cell import PandaCell, matrix
+from robust_instant_policy.tasks.maniskill.camera import matrix
+from robust_instant_policy.tasks.maniskill_benchmark.cell import PandaCell
 from robust_instant_policy.tasks.poses import downward, pitched
 
 ABOVE_M = 0.10  # of the tool, over what it will grasp or has put down

@@ -122,10 +122,7 @@ class Environment:
             f"site {model.site(i).name}" for i in range(model.nsite)
         ]
         turned = np.concatenate([data.xmat, data.site_xmat]).reshape(-1, 3, 3)
-        places = np.concatenate([data.xpos, data.site_xpos])
-        return SceneTruth(
-            parts, tuple(names), np.array([make_pose(*pair) for pair in zip(turned, places, strict=True)])
-        )
+        return SceneTruth(parts, tuple(names), make_pose(turned, np.concatenate([data.xpos, data.site_xpos])))
 
     def video_frame(self) -> Image:
         """A frame of one of the benchmark's own cameras, with the robot."""

@@ -10,13 +10,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from robust_instant_policy.checks import check_name
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import RipError, UnknownNameError
+from robust_instant_policy.errors import RipError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pose
 from robust_instant_policy.motion.gripper_changes import state_of_opening
 from robust_instant_policy.tasks.aloha.renderer import require_renderer
-from robust_instant_policy.tasks.level import NOISE, PAPER, Level, make_level
+from robust_instant_policy.tasks.level import CAMERA_LEVELS, PAPER, Level, make_level
 from robust_instant_policy.tasks.metaworld.benchmark import PREFIX
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, bounded_seed
@@ -171,11 +172,7 @@ def _hand_path(
 
 def make(name: str, objects: str, assets: str, level: str) -> MetaWorldTask:
     """The task ``name``; Meta-World has one set of objects."""
-    for kind, given, known in (
-        (f"set of objects of {name}", objects, ("seen",)),
-        (f"source of assets of {name}", assets, ("code",)),
-        (f"level of {name}", level, (PAPER.name, NOISE.name)),
-    ):
-        if given not in known:
-            raise UnknownNameError(kind, given, known)
+    check_name(f"set of objects of {name}", objects, ("seen",))
+    check_name(f"source of assets of {name}", assets, ("code",))
+    check_name(f"level of {name}", level, CAMERA_LEVELS)
     return MetaWorldTask(name, make_level(level))
