@@ -9,9 +9,10 @@ import pytest
 
 from robust_instant_policy.context import Prompt, SequencePrompt, write_prompt
 from robust_instant_policy.context.alignment import align
+from robust_instant_policy.context.discovery import find_things
 from robust_instant_policy.context.frames import Anchor, Axes, Frame
 from robust_instant_policy.context.step_frames import StepFrames
-from robust_instant_policy.context.things import WORLD, find_things, locate, robust_fit
+from robust_instant_policy.context.things import WORLD, locate, robust_fit
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import GripperTriangle, make_pose
 from robust_instant_policy.trajectory import Trajectory

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from robust_instant_policy.context.choice import NOISE_M
+from robust_instant_policy.context.candidates import NOISE_M
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.context.choice import NOISE_M
+from robust_instant_policy.context.candidates import NOISE_M
 from robust_instant_policy.context.codec import MM, read_rows, row_grammar, row_pattern, write_row
 from robust_instant_policy.context.frames import Frame, runs
 from robust_instant_policy.context.prompt import INSTRUCTION, REACH_MM, Prompt

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.context.choice import NOISE_M
+from robust_instant_policy.context.candidates import NOISE_M
 from robust_instant_policy.geometry import FloatArray, fit_rigid
 
 STEP_M = 0.01  # by how much a corrected step may differ from a predicted one

@@ -13,6 +13,7 @@ from robust_instant_policy.context.choice import choose_frames
 from robust_instant_policy.context.codec import MM
 from robust_instant_policy.context.frames import WORLD_FRAME, Frame, FrameUse, runs
 from robust_instant_policy.context.joins import joined, shown_jumps
+from robust_instant_policy.context.prediction import Hands
 from robust_instant_policy.context.things import DEMOS_TO_TELL_THINGS, WORLD, Thing, locate
 from robust_instant_policy.context.ways import Ranking
 from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
@@ -52,14 +53,14 @@ class StepFrames:
         second: NDArray[np.bool_] | None = None,
     ) -> StepFrames:
         """The frames in which demonstrations with ``keypoints (I, K, 3)``, named by ``ranking``, and aligned ``actions
-        (I, T, 10·A)`` predict each other best; ``key_steps`` count more, and those of a ``second (I,)`` way may do
-        something else in the same frames (see `choose_frames`)."""
+        (I, T, 10·A)`` predict each other best; ``key_steps`` count more. For those of a ``second (I,)`` way see
+        `Hands`."""
         scene, hands = locate([WORLD, *things], keypoints), hands_of(actions)
-        arms = [hands[:, :, arm] for arm in range(hands.shape[2])]
-        frames = tuple(tuple(choose_frames(things, scene, own, key_steps, second)) for own in arms)
+        arms = [Hands(hands[:, :, arm], second) for arm in range(hands.shape[2])]
+        frames = tuple(tuple(choose_frames(things, scene, own, key_steps)) for own in arms)
         between = list(key_steps)[1:-1] if len(hands) >= DEMOS_TO_TELL_THINGS else []
         error = max((own[step].error for own in frames for step in between), default=float("nan"))
-        return cls(frames, ranking, tuple(map(shown_jumps, arms)), error)
+        return cls(frames, ranking, tuple(shown_jumps(own.points) for own in arms), error)
 
     @property
     def num_arms(self) -> int:

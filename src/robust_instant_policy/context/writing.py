@@ -7,13 +7,15 @@ from dataclasses import replace
 from typing import get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robust_instant_policy.context.alignment import AlignedDemonstrations, align
+from robust_instant_policy.context.discovery import find_things
 from robust_instant_policy.context.factorised import FactorisedPrompt, as_turns, make_questions
 from robust_instant_policy.context.prompt import Frames, Layout, Prompt
 from robust_instant_policy.context.sequence import SequencePrompt, raw_rows, sequence_example
 from robust_instant_policy.context.step_frames import StepFrames, hands_of
-from robust_instant_policy.context.things import WORLD, find_things, locate
+from robust_instant_policy.context.things import WORLD, locate
 from robust_instant_policy.context.ways import find_ranking, find_split
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray
@@ -80,19 +82,19 @@ def adaptive_prompt(keypoints: FloatArray, aligned: AlignedDemonstrations) -> Fa
     ranking = find_ranking(keypoints, hands)
     named = keypoints if ranking is None else ranking.renamed(keypoints)
     things = find_things(named)
-    found = find_split(things, locate([WORLD, *things], named), hands)
-    every = np.ones(len(named), dtype=bool)
-    sides = [every] if found is None else [~found[1], found[1]]
-    shared = found is not None and found[2]
-    ways = []
-    for side in sides:
-        among, second = (every, found[1]) if found is not None and shared else (side, None)
+    split = find_split(things, locate([WORLD, *things], named), hands)
+
+    def way(shown: NDArray[np.bool_], among: NDArray[np.bool_], second: NDArray[np.bool_] | None) -> FactorisedPrompt:
+        """The prompt that shows some demonstrations, in the frames that suit all those ``among`` which they are."""
         frames = StepFrames.adaptive(named[among], aligned.actions[among], aligned.key_steps, things, ranking, second)
-        ways.append(_factorised(frames, keypoints, aligned, np.flatnonzero(side)))
-    if found is None:
-        return ways[0]
-    most = max(ways, key=lambda way: len(way.shown))
-    return replace(most, split=found[0], parts=tuple(ways))
+        return _factorised(frames, keypoints, aligned, np.flatnonzero(shown))
+
+    every = np.ones(len(named), dtype=bool)
+    if split is None:
+        return way(every, every, None)
+    sides = (~split.second, split.second)
+    ways = tuple(way(side, every, split.second) if split.alike else way(side, side, None) for side in sides)
+    return replace(max(ways, key=lambda one: len(one.shown)), split=split, parts=ways)
 
 
 def _sequence(keypoints: FloatArray, aligned: AlignedDemonstrations) -> SequencePrompt:
