@@ -39,8 +39,7 @@ class CloseCabinetEnv(CellEnv):
     door: Door
     cabinet: Mechanism
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         rng = self.draw("shape")
         if self.assets == "maniskill":
             self.cabinet, self.door = partnet.load_cabinet(self.scene, self.objects, rng)

@@ -33,8 +33,7 @@ class OpenDrawerEnv(CellEnv):
     drawer: Drawer
     chest: Mechanism
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         if self.assets == "maniskill":
             self.chest, self.drawer = partnet.load_chest(self.scene, self.draw("shape"))
         else:

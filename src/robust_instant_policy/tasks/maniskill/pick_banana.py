@@ -46,8 +46,7 @@ class PickBananaEnv(CellEnv):
     lie: FloatArray  # the frame of `Banana` in the actor's frame
     rest_height: float  # of the banana's middle over the table
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         if self.assets == "maniskill":
             partnet.require_banana()
             builder = actors.get_actor_builder(self.scene, id=f"ycb:{partnet.YCB_BANANA}")

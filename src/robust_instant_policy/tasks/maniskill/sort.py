@@ -40,8 +40,7 @@ class SortEnv(CellEnv):
     blocks: tuple[Actor, Actor]
     nearer: int
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         *paints, mark = PAINTS[self.objects]
         first, second = (Block(SIZE_M[self.objects], paint, (mark,)) for paint in paints)
         self.blocks = first.build(self.scene, "first block"), second.build(self.scene, "second block")

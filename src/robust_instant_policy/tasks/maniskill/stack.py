@@ -39,8 +39,7 @@ class StackEnv(CellEnv):
     base: Actor
     base_edge: float
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         self.base_edge = float(self.draw("shape").uniform(*BASE_EDGES_M))
         paint, base_paint, mark = PAINTS[self.objects]
         self.cube = Block((EDGE_M,) * 3, paint, (mark,)).build(self.scene, "cube")

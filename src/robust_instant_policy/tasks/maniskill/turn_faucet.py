@@ -37,8 +37,7 @@ class TurnFaucetEnv(CellEnv):
     lever: Lever
     faucet: Mechanism
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         rng = self.draw("shape")
         if self.assets == "maniskill":
             self.faucet, self.lever = partnet.load_faucet(self.scene, self.objects, rng)

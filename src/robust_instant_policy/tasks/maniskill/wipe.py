@@ -39,8 +39,7 @@ class WipeEnv(CellEnv):
     length: float
     wiped: np.ndarray
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         self.length = float(self.draw("shape").uniform(*LENGTHS_M))
         self.height = HEIGHT_M[self.objects]
         size = (self.length, WIDTH_M[self.objects], self.height)
