@@ -122,9 +122,9 @@ def _tips(actions: FloatArray) -> FloatArray:
 
 
 def _typical(paths: FloatArray) -> FloatArray:
-    """What is usual of ``paths (I, n, D)``, metres, for the ends of each: ``(I, n, D)``.
+    """The path ``(I, n, D)`` that is expected between the two ends of each of ``paths (I, n, D)``, metres.
 
-    At each step a constant distance from the first point, and a share of the way to the last one.
+    At each step a constant distance from the first point and a share of the way to the last one, the same in all.
     """
     first = paths[:, :1]
     way = paths[:, -1:] - first

@@ -1,8 +1,8 @@
 """Smooth joins where the frame of a trajectory changes.
 
 Two frames predict neighbouring steps independently: between them the gripper may jump or turn on the spot by far more
-than any demonstration does. Steps on the way are predicted with larger errors than those at things, and give way: the
-corrections d_t of the steps, points and turns alike, minimise
+than any demonstration does. A smooth motion needs corrections d_t, of points and turns alike. Steps between things are
+predicted with larger errors than those at things and are corrected more: the corrections minimise
 
     Σ_t |d_t|² / e_t² + Σ_t |d_{t+1} - d_t + j_t|² / `STEP_M`²
 

@@ -105,7 +105,7 @@ class StepFrames:
         return poses.reshape(len(keypoints), -1, self.num_arms, 4, 4)
 
     def named(self, keypoints: FloatArray) -> FloatArray:
-        """``keypoints (I, K, 3)`` by the names that they have in the frames."""
+        """``keypoints (I, K, 3)`` in the order in which the frames count them, see `Ranking.renamed`."""
         return keypoints if self.ranking is None else self.ranking.renamed(keypoints)
 
     def encode(self, poses: FloatArray, actions: FloatArray) -> FloatArray:

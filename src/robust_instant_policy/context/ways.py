@@ -1,9 +1,9 @@
-"""Demonstrations that do different things in different scenes: what decides, and which way a new scene goes.
+"""Demonstrations that do different things in different scenes: what decides, and which way applies in a new scene.
 
-Two kinds of decisions are told apart. Where things are alike, one of them may be meant by its *rank*: the nearest, the
-second from the left. Keypoints are then renamed, so that the first thing is the first in order, and all demonstrations
-do the same again. Else the demonstrations may be *split* in two by a threshold on one measure of the scene. Either is
-believed where the demonstrations then predict each other better at the key steps.
+There are two kinds of decisions. Of several things of the same shape, demonstrations may use one by its *rank*: the
+nearest, the second from the left. The keypoints are then renamed in this order, so that all demonstrations do the same.
+Else a threshold on one measure of the scene may *split* the demonstrations in two. Either is accepted where the
+demonstrations then predict each other better at the key steps.
 """
 
 from __future__ import annotations
@@ -92,8 +92,8 @@ class Split:
 
 
 def find_ranking(keypoints: FloatArray, hands: FloatArray) -> Ranking | None:
-    """The order by which things alike are meant in demonstrations with ``keypoints (I, K, 3)`` and ``hands (I, T, A, 3,
-    3)`` at the key steps; None where their names are as good."""
+    """The order by which demonstrations with ``keypoints (I, K, 3)`` choose among things of the same shape, from their
+    ``hands (I, T, A, 3, 3)`` at the key steps; None where the names of the things are as good."""
     things = find_things(keypoints, hinges=False)
     blocks = _alike(things)
     if not blocks:

@@ -51,8 +51,8 @@ class Gate:
     def start(self, states: Sequence[ArmState]) -> None:
         """Take the measured joints as the last command; raises `StoppedError` if the arms are not ready.
 
-        A gripper that was told to close, or that presses on something, is told to close: the measured width would end
-        its force.
+        A gripper whose command was to close, or that presses on something, keeps the command to close: a command of the
+        measured width would end its force.
         """
         now = time.monotonic()
         self._clocks, self._fresh, self._opening = [-math.inf] * len(states), [now] * len(states), [0] * len(states)

@@ -1,4 +1,4 @@
-"""A Gaussian process from keypoints to each step: the cheap learner that every expensive one must beat."""
+"""A Gaussian process from keypoints to each step: a fast baseline for the language models."""
 
 from __future__ import annotations
 

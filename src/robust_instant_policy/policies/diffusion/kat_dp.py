@@ -136,7 +136,7 @@ def _padded(actions: FloatArray) -> FloatArray:
 
 
 def _described(settings: Settings) -> str:
-    """What decides the weights beside the demonstrations; what is usual has no name, as in earlier checkpoints."""
+    """The settings that decide the weights; default values are left out, so that names of checkpoints stay the same."""
     found = {str(settings.keypoints), settings.column} - {Settings().keypoints, Settings().column}
     return (
         f"{settings.num_keypoints} keypoints by {' '.join((settings.features, *sorted(found)))}, "

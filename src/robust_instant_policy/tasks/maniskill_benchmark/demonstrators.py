@@ -80,8 +80,8 @@ def place_sphere(cell: PandaCell, rng: np.random.Generator) -> list[Stroke]:
 def lift_peg_upright(cell: PandaCell, rng: np.random.Generator) -> list[Stroke]:
     """Grasp the peg at its middle and put it upright about a place where the wrist can turn that far.
 
-    The place varies by centimetres, as a person's would: from paths that all end at one point, the checks conclude that
-    time was reversed.
+    The place varies by centimetres, as a person's would. (Paths that all end at one point look to the checks as if they
+    were recorded backwards.)
     """
     backward, forward = pitched(-0.3, 0.0), pitched(1.22, 0.0)
     tool = make_pose(backward, place(cell.env.peg))

@@ -32,7 +32,7 @@ SETTLE_STEPS = 20  # at the last waypoint
 FOLLOW_GAIN = 0.25  # share of the hand's error that an action corrects, as in most of the scripted experts
 MAX_STEP_M = 0.008  # of the commanded hand, so that an action of at most 10 mm an axis can correct it
 CLOSE_EFFORT, OPEN_EFFORT = 0.8, -1.0  # of the fingers; the scripted experts close with 0.6 to 1
-AFTER_SUCCESS_STEPS = 30  # that a demonstration goes on, so that it does not end at the rim of the goal
+AFTER_SUCCESS_STEPS = 30  # of a demonstration after success, so that it does not end at the border of the goal
 FRAME_EVERY = 4  # control steps from video frame to video frame
 SEED_BITS = 31
 
