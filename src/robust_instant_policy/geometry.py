@@ -108,6 +108,11 @@ def fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) -> 
     return make_pose(rotation, target_mean - (rotation @ source_mean[..., None])[..., 0])
 
 
+def interpolate(at: np.ndarray, times: np.ndarray, values: FloatArray) -> FloatArray:
+    """``values (T, D)`` at increasing ``times (T,)``, linearly interpolated at ``at (M,)``: ``(M, D)``."""
+    return np.stack([np.interp(at, times, column) for column in values.T], axis=1)
+
+
 def project(points: ArrayLike, intrinsics: ArrayLike, camera_pose: ArrayLike) -> FloatArray:
     """Pixels ``(..., 2)`` (column u, row v) of world ``points (..., 3)``; pixel centres are integers."""
     local = transform_points(invert_pose(camera_pose), points)

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from robust_instant_policy.context.candidates import NOISE_M
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, interpolate
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 CURVATURE_MARGIN = 2.0  # a new scene may need this many times the curvature that was shown
@@ -163,5 +163,4 @@ def _matched(total: FloatArray) -> FloatArray:
 
 def _at(actions: FloatArray, times: FloatArray) -> FloatArray:
     """``actions (n, D)`` between their steps, at ``times (m,)``."""
-    steps = np.arange(len(actions))
-    return np.stack([np.interp(times, steps, column) for column in actions.T], axis=1)
+    return interpolate(times, np.arange(len(actions)), actions)

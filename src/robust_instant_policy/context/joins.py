@@ -16,12 +16,11 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.context.candidates import NOISE_M
-from robust_instant_policy.geometry import FloatArray, fit_rigid
+from robust_instant_policy.geometry import FloatArray, fit_rigid, interpolate
 
 STEP_M = 0.01  # by how much a corrected step may differ from a predicted one
 KEY_SHARE = 0.01  # of the error of key steps
@@ -43,7 +42,7 @@ def joined(
     before = np.array(sorted(changes), dtype=int) - 1
     usual = np.setdiff1d(np.arange(len(motions)), before)
     if len(usual):
-        jumps[before] = motions[before] - _interpolated(motions, usual, before)
+        jumps[before] = motions[before] - interpolate(before, usual, motions[usual])
     for part, allowed in zip((slice(0, 3), slice(3, 6)), demonstrated.T, strict=True):
         size = np.linalg.norm(jumps[:, part], axis=1)
         jumps[:, part] *= np.maximum(1 - allowed / np.maximum(size, 1e-9), 0.0)[:, None]
@@ -76,11 +75,6 @@ def hand_motions(hands: FloatArray) -> FloatArray:
     shape = hands - centre[:, None]
     turns = Rotation.from_matrix(fit_rigid(shape[:-1], shape[1:])[:, :3, :3]).as_rotvec()
     return np.concatenate([np.diff(centre, axis=0), turns], axis=1)
-
-
-def _interpolated(motions: FloatArray, usual: NDArray[np.intp], at: NDArray[np.intp]) -> FloatArray:
-    """``(len(at), D)``: the ``motions (T, D)`` of the steps ``usual``, interpolated to the steps ``at``."""
-    return np.stack([np.interp(at, usual, column) for column in motions[usual].T], axis=1)
 
 
 def _unlike_neighbours(motions: FloatArray) -> FloatArray:

@@ -96,10 +96,11 @@ class Settings:
     @property
     def of_context(self) -> Settings:
         """These settings with what the context does not depend on at its default: equal ones give equal contexts."""
-        return self._only(
+        names = (
             "num_keypoints", "features", "column", "keypoints", "workspace", "downsampling", "num_steps", "frames",
-            "layout",
+            "layout", "seed",
         )  # fmt: skip
+        return Settings(**{name: getattr(self, name) for name in names})
 
     @property
     def descriptors(self) -> DescriptorSettings | None:
@@ -118,9 +119,6 @@ class Settings:
             if name not in known:
                 raise UsageError(f"unknown setting {name!r}; known: {', '.join(known)}")
         return replace(self, **options)  # type: ignore[arg-type]
-
-    def _only(self, *names: str) -> Settings:
-        return Settings(seed=self.seed, **{name: getattr(self, name) for name in names})
 
 
 def _corners(workspace: ArrayLike) -> tuple[tuple[float, ...], ...]:

@@ -12,8 +12,8 @@ from scipy.special import stdtrit
 
 from robust_instant_policy.checks import check_name, checked_array, checked_positive
 from robust_instant_policy.errors import InvalidValueError, UsageError
-from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.regression.candidates import Candidates, group_matrix, interpolate
+from robust_instant_policy.geometry import FloatArray, interpolate
+from robust_instant_policy.regression.candidates import Candidates, group_matrix
 from robust_instant_policy.regression.em import DEFAULT_DOF, MAX_ITERATIONS
 from robust_instant_policy.regression.likelihood import Fit, Problem, improve, maximise, pose_problem
 from robust_instant_policy.regression.modes import share_at_ties

@@ -62,10 +62,12 @@ class KeypointDiffusion(KeypointPolicy):
         actions = aligned.actions
         self._keypoints, self._actions = keypoints, actions
         self._inputs, self._outputs, self._grippers = Scaling.of(keypoints), Scaling.of(actions), Grippers.of(actions)
+        # the last step is repeated up to a length that the network takes
+        padding = ((0, 0), (0, -actions.shape[1] % LENGTH_MULTIPLE), (0, 0))
         data = _KeypointData(
             torch.tensor(self._inputs.scaled(keypoints), dtype=torch.float32),
             torch.tensor(KEYPOINT_NOISE_M / self._inputs.half_range, dtype=torch.float32),
-            torch.tensor(_padded(self._outputs.scaled(actions)), dtype=torch.float32),
+            torch.tensor(np.pad(self._outputs.scaled(actions), padding, mode="edge"), dtype=torch.float32),
         )
         settings = TrainingSettings(
             METHOD,
@@ -128,11 +130,6 @@ class _KeypointData:
         keypoints = self._keypoints[indices]
         noise = self._noise * torch.randn(keypoints.shape, generator=generator)
         return (keypoints + noise,), self._actions[indices]
-
-
-def _padded(actions: FloatArray) -> FloatArray:
-    """``actions (I, T, D)`` with the last step repeated up to a length that the network takes."""
-    return np.pad(actions, ((0, 0), (0, -actions.shape[1] % LENGTH_MULTIPLE), (0, 0)), mode="edge")
 
 
 def _described(settings: Settings) -> str:
