@@ -86,10 +86,12 @@ def fit_rigid(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
 
 def rotations_about_vertical(angles: ArrayLike) -> FloatArray:
     """Rotations ``(..., 3, 3)`` by ``angles (...)`` radians about the world's z axis."""
-    cos, sin = np.cos(angles), np.sin(angles)
-    zero = np.zeros_like(cos)
-    rows = [cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1]
-    return np.stack(rows, axis=-1).reshape(*np.shape(angles), 3, 3)
+    rotation = np.zeros((*np.shape(angles), 3, 3))
+    rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(angles)
+    rotation[..., 1, 0] = np.sin(angles)
+    rotation[..., 0, 1] = -rotation[..., 1, 0]
+    rotation[..., 2, 2] = 1.0
+    return rotation
 
 
 def fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:

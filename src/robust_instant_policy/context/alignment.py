@@ -153,12 +153,13 @@ def _warped_times(paths: FloatArray, others: FloatArray) -> FloatArray:
 def _matched(total: FloatArray) -> FloatArray:
     """For each of n steps the mean ``(n,)`` of those that are matched with it, from the costs ``(n + 1, m + 1)``."""
     i, j = total.shape[0] - 1, total.shape[1] - 1
+    cost = total.tolist()  # lists are read several times as fast as single elements of an array
     matched: list[list[int]] = [[] for _ in range(i)]
     while i and j:
         matched[i - 1].append(j - 1)
-        before = (total[i - 1, j - 1], total[i - 1, j] + WAITING_M, total[i, j - 1] + WAITING_M)
-        i, j = ((i - 1, j - 1), (i - 1, j), (i, j - 1))[int(np.argmin(before))]
-    return np.array([float(np.mean(own)) for own in matched])
+        before = (cost[i - 1][j - 1], cost[i - 1][j] + WAITING_M, cost[i][j - 1] + WAITING_M)
+        i, j = ((i - 1, j - 1), (i - 1, j), (i, j - 1))[before.index(min(before))]
+    return np.array([sum(own) / len(own) for own in matched])
 
 
 def _at(actions: FloatArray, times: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ demonstrations then predict each other better at the key steps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -24,6 +24,7 @@ from robust_instant_policy.context.things import WORLD, Scene, Thing, locate
 from robust_instant_policy.geometry import FloatArray, fit_upright, transform_points
 
 RANK_GAIN, SPLIT_GAIN = 1.0, 1.0  # sums of logarithms of the errors at key steps by which an explanation must be better
+LARGEST_MARGIN = 1.0  # standard deviations by which what decides may differ; more counts no more
 MAX_SPLITS = 40  # ways to part the demonstrations that are tried, those with the widest gaps
 LEAST_OF_A_WAY = 2  # demonstrations
 FEW_OF_A_WAY = 4  # demonstrations up to which a way may have to share the frames of the other
@@ -107,7 +108,8 @@ def find_ranking(keypoints: FloatArray, hands: FloatArray) -> Ranking | None:
     best, least = None, _cost(_squared(things, locate([WORLD, *things], keypoints), hands)) - RANK_GAIN
     for ranking in rankings:
         named = ranking.renamed(keypoints)
-        cost = _cost(_squared(things, locate([WORLD, *things], named), hands)) - min(ranking.margin(keypoints), 1.0)
+        cost = _cost(_squared(things, locate([WORLD, *things], named), hands))
+        cost -= min(ranking.margin(keypoints), LARGEST_MARGIN)
         cost += RANK_GAIN * bool(ranking.origin)  # what decides is rather one thing's place than a relation of two
         if cost < least:
             best, least = ranking, cost
@@ -144,14 +146,17 @@ def find_split(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> Spli
         second = same[0][0].second
         few = min(second.sum(), demos - second.sum()) <= FEW_OF_A_WAY
         for alike in (False, True) if few else (False,):
-            squared, used = _parted(things, scene, hands, second, alike, int(arm), int(step))
-            if squared.max() >= single.max() / 4:
-                continue
-            margins = [gap / np.sqrt(1 + len(split.measure.members ^ used)) for split, gap in same]
-            widest = int(np.argmax(margins))
-            cost = _cost(squared) - min(margins[widest], 1.0)
-            if cost < least:
-                best, least = replace(same[widest][0], alike=alike), cost
+            used = set[tuple[int, ...]]()  # the things to which the arm moves, where one way explains it worst
+            for squared, candidates, errors in _parted(things, scene, hands, second, alike):
+                if squared.max() >= single.max() / 4 or _cost(squared) - LARGEST_MARGIN >= least:
+                    break
+                used.add(candidates.nearest(errors[arm][step]))
+            else:
+                margins = [gap / np.sqrt(1 + len(split.measure.members ^ used)) for split, gap in same]
+                widest = int(np.argmax(margins))
+                cost = _cost(squared) - min(margins[widest], LARGEST_MARGIN)
+                if cost < least:
+                    best, least = replace(same[widest][0], alike=alike), cost
     return None if best is None or _one_differs(things, scene, hands) else best
 
 
@@ -166,26 +171,23 @@ def _one_differs(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> bo
 
 
 def _parted(
-    things: Sequence[Thing],
-    scene: Scene,
-    hands: FloatArray,
-    second: NDArray[np.bool_],
-    alike: bool,
-    arm: int,
-    step: int,
-) -> tuple[FloatArray, set[tuple[int, ...]]]:
+    things: Sequence[Thing], scene: Scene, hands: FloatArray, second: NDArray[np.bool_], alike: bool
+) -> Iterator[tuple[FloatArray, Candidates, list[FloatArray]]]:
     """Mean squared errors ``(A, T)``, square metres, where demonstrations of either way are predicted from those of the
-    same alone, in frames of their own or shared ones (``alike``); and the things to which an arm moves at a step."""
+    same alone, in frames of their own or shared ones (``alike``); with the candidates and their errors.
+
+    First of one way alone, then of both: errors only grow, so that the second way is evaluated on demand.
+    """
     if alike:
         candidates, errors = _errors(things, scene, hands, second=second)
-        return _least(errors), {candidates.nearest(errors[arm][step])}
-    squared, used = np.zeros((hands.shape[2], hands.shape[1])), set[tuple[int, ...]]()
+        yield _least(errors), candidates, errors
+        return
+    squared = np.zeros((hands.shape[2], hands.shape[1]))
     for part in (~second, second):
         own = {thing: located.of(part) for thing, located in scene.items()}
         candidates, errors = _errors(things, own, hands[part])
-        squared += part.mean() * _least(errors)
-        used.add(candidates.nearest(errors[arm][step]))
-    return squared, used
+        squared = squared + part.mean() * _least(errors)
+        yield squared, candidates, errors
 
 
 def _squared(things: Sequence[Thing], scene: Scene, hands: FloatArray) -> FloatArray:
