@@ -27,7 +27,7 @@ from robust_instant_policy.context.candidates import (
     Origin,
 )
 from robust_instant_policy.context.frames import Anchor, Axes, Frame
-from robust_instant_policy.context.prediction import Errors, Hands, prediction_errors
+from robust_instant_policy.context.prediction import Errors, ShownHands, prediction_errors
 from robust_instant_policy.context.things import DEMOS_TO_TELL_THINGS, WORLD, Scene, Thing
 from robust_instant_policy.geometry import FloatArray
 
@@ -40,7 +40,7 @@ OTHER_SHARES, MAX_SHARES = 0.3, 4  # difference of shares along an axis for an o
 IntArray = NDArray[np.intp]
 
 
-def choose_frames(things: Sequence[Thing], scene: Scene, hands: Hands, key_steps: Sequence[int]) -> list[Frame]:
+def choose_frames(things: Sequence[Thing], scene: Scene, hands: ShownHands, key_steps: Sequence[int]) -> list[Frame]:
     """The frame of each step for one arm's ``hands`` in demonstrations with ``things`` in a ``scene``."""
     weight = np.ones(hands.points.shape[1])
     weight[list(key_steps)] = KEY_STEP_WEIGHT
@@ -77,7 +77,7 @@ def _best(errors: Errors) -> IntArray:
     return np.stack(np.unravel_index(cost.reshape(len(cost), -1).argmin(axis=1), cost.shape[1:]), axis=1)
 
 
-def _with_weighted_points(candidates: Candidates, errors: Errors, hands: Hands) -> Candidates:
+def _with_weighted_points(candidates: Candidates, errors: Errors, hands: ShownHands) -> Candidates:
     """``candidates``, where origins by axis that suit some steps best have the shares that were fitted to these steps,
     each set of shares in an origin of its own.
 
@@ -98,7 +98,7 @@ def _with_weighted_points(candidates: Candidates, errors: Errors, hands: Hands) 
     return replace(candidates, origins=tuple(origins))
 
 
-def _with_fitted_lines(candidates: Candidates, errors: Errors, hands: Hands) -> Candidates:
+def _with_fitted_lines(candidates: Candidates, errors: Errors, hands: ShownHands) -> Candidates:
     """``candidates`` with those lines fitted that suit some step best."""
     picks = _best(errors)
     axes = list(candidates.axes)
@@ -110,7 +110,7 @@ def _with_fitted_lines(candidates: Candidates, errors: Errors, hands: Hands) -> 
     return replace(candidates, axes=tuple(axes))
 
 
-def _fitted_line(candidates: Candidates, axes: Axes, hands: Hands, origins: IntArray) -> Axes:
+def _fitted_line(candidates: Candidates, axes: Axes, hands: ShownHands, origins: IntArray) -> Axes:
     """``axes`` with the ends between which the line predicts the ``hands`` best, each step's origin being one of
     ``origins (T,)``; by robust least squares, with the other numbers eliminated."""
     free = [end.thing.turns or end.thing is WORLD for end in axes.ends]
@@ -141,7 +141,7 @@ def _fitted_line(candidates: Candidates, axes: Axes, hands: Hands, origins: IntA
     return moved(fit.x)
 
 
-def _fitted(candidates: Candidates, errors: Errors, hands: Hands, picks: IntArray) -> list[Frame]:
+def _fitted(candidates: Candidates, errors: Errors, hands: ShownHands, picks: IntArray) -> list[Frame]:
     """The frames of ``picks (T, 2)`` (axes, origin), with their numbers fitted robustly to the demonstrations."""
     start, design, penalty = candidates.model(hands.home, hands.second)
     centre = hands.centre

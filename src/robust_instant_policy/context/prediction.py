@@ -27,7 +27,7 @@ DISTANCE_SHARE, UNTURNED_SHARE = 0.05, 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Hands:
+class ShownHands:
     """One arm's hand as I demonstrations show it: ``points (I, T, 3, 3)``, the gripper's three points at T steps.
 
     Those of a ``second (I,)`` way, where there are two, have an offset and a turn of their own in the same frames.
@@ -84,7 +84,7 @@ class Errors:
         return self.squared.mean(axis=-1) * np.exp(2 * self.penalty)
 
 
-def prediction_errors(candidates: Candidates, hands: Hands) -> Errors:
+def prediction_errors(candidates: Candidates, hands: ShownHands) -> Errors:
     """Leave-one-out errors of all ``candidates`` for one arm's ``hands``."""
     demos = len(hands)
     start, design, penalty = candidates.model(hands.home, hands.second)

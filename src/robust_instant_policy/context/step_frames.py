@@ -13,7 +13,7 @@ from robust_instant_policy.context.choice import choose_frames
 from robust_instant_policy.context.codec import MM
 from robust_instant_policy.context.frames import WORLD_FRAME, Frame, FrameUse, runs
 from robust_instant_policy.context.joins import joined, shown_jumps
-from robust_instant_policy.context.prediction import Hands
+from robust_instant_policy.context.prediction import ShownHands
 from robust_instant_policy.context.things import DEMOS_TO_TELL_THINGS, WORLD, Thing, locate
 from robust_instant_policy.context.ways import Ranking
 from robust_instant_policy.geometry import FloatArray, invert_pose, transform_points
@@ -54,9 +54,9 @@ class StepFrames:
     ) -> StepFrames:
         """The frames in which demonstrations with ``keypoints (I, K, 3)``, named by ``ranking``, and aligned ``actions
         (I, T, 10·A)`` predict each other best; ``key_steps`` count more. For those of a ``second (I,)`` way see
-        `Hands`."""
+        `ShownHands`."""
         scene, hands = locate([WORLD, *things], keypoints), hands_of(actions)
-        arms = [Hands(hands[:, :, arm], second) for arm in range(hands.shape[2])]
+        arms = [ShownHands(hands[:, :, arm], second) for arm in range(hands.shape[2])]
         frames = tuple(tuple(choose_frames(things, scene, own, key_steps)) for own in arms)
         between = list(key_steps)[1:-1] if len(hands) >= DEMOS_TO_TELL_THINGS else []
         error = max((own[step].error for own in frames for step in between), default=float("nan"))

@@ -19,7 +19,7 @@ from robust_instant_policy.context.candidates import NOISE_M, Candidates
 from robust_instant_policy.context.choice import UNEXPLAINED_M
 from robust_instant_policy.context.discovery import MAX_THINGS, find_things
 from robust_instant_policy.context.measures import Measure, cuts
-from robust_instant_policy.context.prediction import Hands, prediction_errors
+from robust_instant_policy.context.prediction import ShownHands, prediction_errors
 from robust_instant_policy.context.things import WORLD, Scene, Thing, locate
 from robust_instant_policy.geometry import FloatArray, fit_upright, transform_points
 
@@ -206,7 +206,7 @@ def _errors(
     candidates = Candidates.of(things, scene)
     if more_origins:
         candidates = candidates.with_more_origins(things)
-    arms = (Hands(hands[:, :, arm], second) for arm in range(hands.shape[2]))
+    arms = (ShownHands(hands[:, :, arm], second) for arm in range(hands.shape[2]))
     return candidates, [prediction_errors(candidates, own).mean_squared for own in arms]
 
 

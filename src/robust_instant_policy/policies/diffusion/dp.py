@@ -64,15 +64,9 @@ class ImageDiffusion:
         self._shown, self._every = demonstrations, every
         actions = [shown.trajectory.actions[_kept(len(shown.trajectory), every)] for shown in demonstrations]
         self._scaling, self._grippers = Scaling.of(np.concatenate(actions)), Grippers.of(np.concatenate(actions))
-        settings = TrainingSettings(
-            METHOD,
-            self.training.steps,
-            BATCH_SIZE,
-            NOISE_DRAWS,
-            LEARNING_RATE,
-            self.training.seed,
-            details=f"{HORIZON} actions at {self.rate_hz:g} Hz, crops of {CROP_PIXELS} of {IMAGE_PIXELS} pixels",
-        )
+        details = f"{HORIZON} actions at {self.rate_hz:g} Hz, crops of {CROP_PIXELS} of {IMAGE_PIXELS} pixels"
+        steps, seed = self.training.steps, self.training.seed
+        settings = TrainingSettings(METHOD, steps, BATCH_SIZE, NOISE_DRAWS, LEARNING_RATE, seed, details)
         width = actions[0].shape[1]
         self.trained_ = obtain(
             lambda: Denoiser(_Encoder(), HISTORY * (ImageEncoder.features + width), width),

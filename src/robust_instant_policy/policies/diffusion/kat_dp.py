@@ -69,15 +69,8 @@ class KeypointDiffusion(KeypointPolicy):
             torch.tensor(KEYPOINT_NOISE_M / self._inputs.half_range, dtype=torch.float32),
             torch.tensor(np.pad(self._outputs.scaled(actions), padding, mode="edge"), dtype=torch.float32),
         )
-        settings = TrainingSettings(
-            METHOD,
-            self.training.steps,
-            BATCH_SIZE,
-            NOISE_DRAWS,
-            LEARNING_RATE,
-            self.training.seed,
-            details=_described(self.settings),
-        )
+        steps, seed, details = self.training.steps, self.training.seed, _described(self.settings)
+        settings = TrainingSettings(METHOD, steps, BATCH_SIZE, NOISE_DRAWS, LEARNING_RATE, seed, details)
         self.trained_ = obtain(
             lambda: Denoiser(nn.Identity(), keypoints.shape[1], actions.shape[2]),
             lambda: data,
