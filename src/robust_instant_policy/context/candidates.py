@@ -26,7 +26,7 @@ from robust_instant_policy.geometry import FloatArray
 NOISE_M = 0.003  # of demonstrated points in a frame that suits them
 # Standard deviations a priori of what is fitted: share of the way; a point in a thing, an offset, its growth in metres.
 SHARE_STD, POINT_STD_M, OFFSET_STD_M, GROWTH_STD_M = 0.7, 0.02, 0.5, 0.1
-MAX_LOOSE = 4  # keypoints of their own, between which lines are drawn
+MAX_LOOSE = 4  # keypoints of their own between which lines are drawn; with more, the choice takes too long
 # Where the numbers w stand: shares, three for each further end; points in the ends; offset; its growth with each size.
 SHARES, POINTS, OFFSET, GROWTH = slice(0, 6), slice(6, 15), slice(15, 18), slice(18, None)
 

@@ -35,7 +35,7 @@ TRANSITION_COST = 1.0  # of a change of frame between two steps, in logarithms o
 KEY_STEP_WEIGHT = 3.0  # of the first and last step and of gripper changes; 1 elsewhere
 TURN_WEIGHT = 0.6  # of the gripper's points about its centre against the centre, where a line is fitted
 UNEXPLAINED_M = 0.015  # error of a key step from which on more origins are tried
-OTHER_SHARES, MAX_SHARES = 0.3, 4  # difference of shares along an axis for an origin of their own, and how many of one
+OTHER_SHARES = 0.3  # difference of shares along an axis from which on they have an origin of their own
 
 IntArray = NDArray[np.intp]
 
@@ -91,8 +91,7 @@ def _with_weighted_points(candidates: Candidates, errors: Errors, hands: ShownHa
         steps = np.flatnonzero(picks[:, 1] == number) if origin.by_axis else ()
         for step in sorted(steps, key=errors.cost.min(axis=(1, 2)).__getitem__):
             shares = frames[step].shares[0]
-            is_new = all(np.abs(shares - known).max() > OTHER_SHARES for known in different)
-            if is_new and len(different) < MAX_SHARES:
+            if all(np.abs(shares - known).max() > OTHER_SHARES for known in different):
                 different.append(shares)
         origins += [replace(origin, shares=shares) for shares in different] or [origin]
     return replace(candidates, origins=tuple(origins))

@@ -38,7 +38,7 @@ HINGE_PRIOR = 0.01  # weight of the first guess: turning about an axis and movin
 LEAST_SCALED = 4  # keypoints of a thing of varying size: two define it
 LEAST_GROWTH = 0.1  # standard deviation of a thing's size, relative; one that varies less shows no size
 SIZE_EXPLAINS = 0.7  # relative spread of distances when divided by the size, below which a thing has one
-MAX_THINGS = 4  # of several keypoints: those of the most keypoints
+MAX_THINGS = 4  # of several keypoints: those of the most keypoints; with more, the choice takes too long
 MIRRORED_DEMOS = 2  # in which a thing has the other hand: a single one may be an error
 
 

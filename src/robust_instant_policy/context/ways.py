@@ -25,7 +25,7 @@ from robust_instant_policy.geometry import FloatArray, fit_upright, transform_po
 
 RANK_GAIN, SPLIT_GAIN = 1.0, 1.0  # sums of logarithms of the errors at key steps by which an explanation must be better
 LARGEST_MARGIN = 1.0  # standard deviations by which what decides may differ; more counts no more
-MAX_SPLITS = 40  # ways to part the demonstrations that are tried, those with the widest gaps
+MAX_SPLITS = 40  # ways to part the demonstrations that are tried, those with the widest gaps; more take too long
 LEAST_OF_A_WAY = 2  # demonstrations
 FEW_OF_A_WAY = 4  # demonstrations up to which a way may have to share the frames of the other
 ALIKE_M = 0.006  # largest difference of the shapes of things that are alike

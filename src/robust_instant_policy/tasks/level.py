@@ -17,6 +17,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.checks import check_name
+from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, make_pose, transform_points
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 from robust_instant_policy.tasks.textures import Color
@@ -56,6 +57,12 @@ class Level:
     hides: bool = False
     start: float = 0.0
     objects: str = "seen"
+
+    def photographed(self, scene: Observation, seed: int, number: int) -> Observation:
+        """Image ``number`` of a ``scene``, with the noise of the camera; it depends on the scene's ``seed``, too."""
+        if self.camera is None:
+            return scene
+        return self.camera.photograph(scene, int(np.random.SeedSequence([seed, number]).generate_state(1)[0]))
 
 
 PAPER = Level("paper")

@@ -225,11 +225,8 @@ class SimulatedTask:
 
     def look(self) -> Observation:
         """What the camera sees now, with the noise of the level."""
-        seen, self._images = self._cell.photograph(), self._images + 1
-        if self._level.camera is None:
-            return seen
-        seed = np.random.SeedSequence([self._seed or 0, self._images]).generate_state(1)[0]
-        return self._level.camera.photograph(seen, int(seed))
+        self._images += 1
+        return self._level.photographed(self._cell.photograph(), self._seed or 0, self._images)
 
     def _recorded(self, poses: FloatArray, every: int) -> range:
         """Indices of the recorded control steps; they include the last one, at which success is judged."""

@@ -118,11 +118,8 @@ class MetaWorldTask:
         self._seed, self._images = seed, 0
 
     def _photograph(self) -> Observation:
-        seen, self._images = self._env.photograph(), self._images + 1
-        if self._level.camera is None:
-            return seen
-        noise = np.random.SeedSequence([self._last_seed(), self._images]).generate_state(1)[0]
-        return self._level.camera.photograph(seen, int(noise))
+        self._images += 1
+        return self._level.photographed(self._env.photograph(), self._last_seed(), self._images)
 
     def _follow_hand(self, path: Iterator[tuple[FloatArray, bool]], on_frame: FrameSink | None) -> float:
         """Command the hand along ``path`` of fingertip points and gripper states, one a control step, until success or
