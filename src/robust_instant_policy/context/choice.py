@@ -17,15 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from robust_instant_policy.context.candidates import (
-    GROWTH,
-    NOISE_M,
-    POINT_STD_M,
-    POINTS,
-    SHARES,
-    Candidates,
-    Origin,
-)
+from robust_instant_policy.context.candidates import GROWTH, NOISE_M, POINT_STD_M, POINTS, SHARES, Candidates, Origin
 from robust_instant_policy.context.frames import Anchor, Axes, Frame
 from robust_instant_policy.context.prediction import Errors, ShownHands, prediction_errors
 from robust_instant_policy.context.things import DEMOS_TO_TELL_THINGS, WORLD, Scene, Thing

@@ -5,7 +5,7 @@ The method of the paper's comparison (Di Palo and Johns 2024; Oh et al. 2025, Se
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from robust_instant_policy.policies.diffusion.grippers import Grippers
 from robust_instant_policy.policies.diffusion.scaling import Scaling
 from robust_instant_policy.policies.diffusion.training import Rehearsal, Trained, TrainingSettings, known_by, obtain
 from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
-from robust_instant_policy.policies.policy import Plan, Progress, Stopwatch, no_progress
+from robust_instant_policy.policies.policy import Plan, Stopwatch
 from robust_instant_policy.policies.sampling import Proposal
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.policies.training import Training
@@ -42,15 +42,8 @@ class KeypointDiffusion(KeypointPolicy):
     name = METHOD
     trained_: Trained
 
-    def __init__(
-        self,
-        settings: Settings | None = None,
-        training: Training | None = None,
-        *,
-        progress: Progress = no_progress,
-        **options: object,
-    ):
-        super().__init__(settings, progress=progress, **options)
+    def __init__(self, settings: Settings | None = None, training: Training | None = None, **options: Any):
+        super().__init__(settings, **options)
         self.training = training or Training()
 
     def fit_context(self, context: Context) -> Self:

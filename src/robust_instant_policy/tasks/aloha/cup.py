@@ -9,14 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.geometry import FloatArray, make_pose
-from robust_instant_policy.tasks.aloha.surfaces import (
-    Body,
-    add_hull,
-    add_surface,
-    free_body,
-    paint,
-    revolved,
-)
+from robust_instant_policy.tasks.aloha.surfaces import Body, add_hull, add_surface, free_body, paint, revolved
 from robust_instant_policy.tasks.textures import Color
 
 MASS_KG = 0.13
