@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
+from robust_instant_policy.checks import checked_array
 from robust_instant_policy.context.alignment import AlignedDemonstrations
 from robust_instant_policy.context.step_frames import StepFrames
 from robust_instant_policy.context.things import DEMOS_TO_TELL_THINGS, WORLD
-from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.query import Query
 from robust_instant_policy.trajectory import Trajectory
@@ -109,8 +107,4 @@ class Prompt(ABC):
 
     def checked(self, keypoints: FloatArray) -> FloatArray:
         """``keypoints`` as an array; raises `InvalidValueError` unless they are ``(K, 3)`` and finite."""
-        keypoints = np.asarray(keypoints, dtype=np.float64)
-        expected = self.keypoints.shape[1:]
-        if keypoints.shape != expected or not np.isfinite(keypoints).all():
-            raise InvalidValueError(f"keypoints must be {expected} and finite, got {keypoints.shape}")
-        return keypoints
+        return checked_array("keypoints", keypoints, str(self.keypoints.shape[1:]))

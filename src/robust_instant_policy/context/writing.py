@@ -9,6 +9,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from robust_instant_policy.checks import checked_array
 from robust_instant_policy.context.alignment import AlignedDemonstrations, align
 from robust_instant_policy.context.discovery import find_things
 from robust_instant_policy.context.factorised import FactorisedPrompt, as_turns, make_questions
@@ -38,12 +39,8 @@ def write_prompt(
     for name, value, known in (("frames", frames, Frames), ("layout", layout, Layout)):
         if value not in get_args(known):
             raise InvalidValueError(f"{name} must be {' or '.join(map(repr, get_args(known)))}, got {value!r}")
-    keypoints = np.asarray(keypoints, dtype=np.float64)
-    if keypoints.ndim != 3 or keypoints.shape[2] != 3 or not len(keypoints):
-        raise InvalidValueError(f"keypoints must be (I, K, 3), got {keypoints.shape}")
-    if not np.isfinite(keypoints).all():
-        raise InvalidValueError(f"keypoints {keypoints.shape} hold values that are not finite")
-    if len(trajectories) != len(keypoints):
+    keypoints = checked_array("keypoints", keypoints, "(I, K, 3)")
+    if len(trajectories) != len(keypoints) or not trajectories:
         raise InvalidValueError(f"{len(keypoints)} sets of keypoints for {len(trajectories)} trajectories")
     widths = {trajectory.actions.shape[1] for trajectory in trajectories}
     if len(widths) > 1:
