@@ -35,9 +35,12 @@ ZERO = np.zeros(3)
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """On which things an origin depends: the ``ends``, one to three, and those with whose size it moves. ``by_axis`` it
-    is at a share of the way of its own along each axis; along each the points in both ends count by the ``shares (3,)``
-    of that way, where these are known."""
+    """Which things an origin depends on.
+
+    It lies at a point of one of the ``ends``, or on the way between two or three of them, and moves with the size of
+    the things in ``growing``. With ``by_axis`` its share of the way differs along each of the frame's axes. Where these
+    ``shares (3,)`` are known, the points in both ends count by them along each axis.
+    """
 
     ends: tuple[Thing, ...]
     growing: tuple[Thing, ...] = ()
@@ -46,7 +49,7 @@ class Origin:
 
     @property
     def weights(self) -> tuple[FloatArray, ...]:
-        """``(3,)``, of the point in each of the ends along each axis."""
+        """How much the point in each of the ends counts along each axis ``(3,)``."""
         return tuple(np.ones((len(self.ends), 3)) if self.shares is None else np.array([1 - self.shares, self.shares]))
 
 
@@ -86,7 +89,7 @@ class Candidates:
         return replace(self, origins=(*self.origins, *more))
 
     def nearest(self, squared: FloatArray) -> tuple[int, ...]:
-        """The keypoints of the one thing whose frames explain a step with errors ``squared (M, N)`` best."""
+        """The keypoints of the thing whose own frames explain a step best, from its errors ``squared (M, N)``."""
         single = [n for n, origin in enumerate(self.origins) if len(origin.ends) == 1]
         return self.origins[single[int(squared[:, single].min(axis=0).argmin())]].ends[0].members
 

@@ -78,8 +78,11 @@ def _clusters(varies: FloatArray, tolerance: float) -> list[tuple[int, ...]]:
 
 
 def _outnumbers(members: tuple[int, ...], clusters: Sequence[tuple[int, ...]]) -> bool:
-    """Whether more keypoints keep their shape than their distances: those that keep their distances are among them, or
-    at most half as many, as neighbours on a thing that hardly grows between them."""
+    """Whether ``members``, which keep their shape, outnumber the ``clusters`` among them, which keep their distances.
+
+    A cluster that overlaps with them must lie within them, or have at most half as many keypoints: neighbours on a
+    thing whose size hardly changes their distance.
+    """
     touching = [set(cluster) for cluster in clusters if not set(cluster).isdisjoint(members)]
     return all(own < set(members) or 2 * len(own) <= len(members) for own in touching)
 
@@ -148,7 +151,7 @@ def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) ->
 
 def _hinge(base: Thing, base_at: Located, points: FloatArray) -> tuple[float, Hinge, FloatArray] | None:
     """The error (metres) of a part with ``points (I, N, 3)`` as one that turns about an axis of ``base``, the hinge,
-    and the part's shape about it; None where nothing swings or no axis is in sight.
+    and the part's shape about it; None where the part turns too little or no axis fits.
 
     Seen from the base, each point moves on a circle in a plane across the axis: a first guess, which is then fitted.
     """
