@@ -58,7 +58,7 @@ class Evidence:
     """What speaks for or against a plan. NaN is unknown.
 
     ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``vote`` in [0, 1] for the way to act
-    that was followed, 0 where either of two may be meant (`Prompt.vote`); how many objects with keypoints are
+    that was followed, 0 where either of two may be meant (`Prompt.decide`); how many objects with keypoints are
     ``doubled``: of two alike, it is not known which is meant; ``distortion`` of the distances between keypoints (see
     `distortion`); ``frames``, metres, the error with which frames that are fitted to the other demonstrations predict
     one at the gripper change at which they do so worst (`StepFrames.error`), and ``prediction``, that of the
