@@ -17,10 +17,10 @@ from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.matching import certainty, find_again, register_all
-from robust_instant_policy.perception.models import Registration, RigidObject
+from robust_instant_policy.perception.models import MIN_FITNESS, Registration, RigidObject
 from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
-from robust_instant_policy.perception.objects import MIN_FITNESS, find_objects, segmentation, without
+from robust_instant_policy.perception.objects import find_objects, segmentation, without
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
 from robust_instant_policy.perception.relevance import hand_places, relevances, shares, still
 from robust_instant_policy.perception.selection import best_buddies, select_points
@@ -73,8 +73,9 @@ class KeypointExtractor:
     `perception.nearest`), which uses no workspace. Deterministic for a ``seed``.
 
     After `fit`: ``keypoints_ (I, K, 3)`` metres, world, ``pixels_ (I, K, 2)`` (u, v) and ``confidence_ (I, K)`` in
-    [0, 1] of I demonstrations; ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``object_of_ (K,)``, the
-    number of each keypoint's; ``segmentations_``, see `segmentation`; ``notes_`` for the user, one line each.
+    [0, 1] of I demonstrations; ``left_out_ (I,)``, those that do not show an object that has keypoints: these are
+    guessed there; ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``object_of_ (K,)``, the number of each
+    keypoint's; ``segmentations_``, see `segmentation`; ``notes_`` for the user, one line each.
     """
 
     def __init__(
@@ -131,12 +132,12 @@ class KeypointExtractor:
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
         objects = find_objects(views, self.seed, hand_places(views, trajectories) if trajectories else None)
-        self.objects_ = without(objects, [thing.worst_fitness < MIN_FITNESS for thing in objects])
+        self.objects_ = without(objects, [not thing.shared for thing in objects])
         if not self.objects_:
-            best = max((thing.worst_fitness for thing in objects), default=0.0)
+            best = max((one.shown.sum() for one in objects), default=0)
             raise KeypointError(
-                f"the images have nothing in common: the best object of the first has a fitness of {best:.2f} in the "
-                f"worst other image (needed: {MIN_FITNESS:.2f}); do all demonstrations show the same object?"
+                f"the images have nothing in common: no object of the first is well recognised in most others (the best "
+                f"is found in {best} of {len(views)}); do all demonstrations show the same object?"
             )
         weights = _weights(self.objects_, views, trajectories)
         counts = shares(weights, self.num_keypoints)
@@ -157,6 +158,14 @@ class KeypointExtractor:
         self.pixels_ = np.stack([located.pixels for located in found])
         self.confidence_ = np.stack([located.confidence for located in found])
         self.object_of_ = np.repeat(np.arange(len(counts)), counts)
+        missing = ~np.array([thing.shown for thing in self.objects_])  # (O, I)
+        missing[np.array(counts) == 0] = False
+        self.left_out_ = missing.any(axis=0)
+        for number, i in np.argwhere(missing):
+            notes.append(
+                f"demonstration {i} is left out: object {number}, which has keypoints, is missing there, hidden, or of "
+                "another look"
+            )
         models = [thing.model for thing in self.objects_]
         self.segmentations_ = tuple(
             segmentation(models, [thing.registrations[i] for thing in self.objects_], view)
@@ -175,6 +184,7 @@ class KeypointExtractor:
         ]
         self.keypoints_, self.pixels_ = (np.stack(of_images) for of_images in zip(*found, strict=True))
         self.confidence_ = self._shared.agreement()
+        self.left_out_ = np.zeros(len(images), dtype=bool)
         return self
 
     @one_blas_thread
@@ -242,8 +252,8 @@ def _weights(
     """Of objects ``(O,)``, for their numbers of keypoints."""
     places = [
         [
-            transform_points(view.to_world @ found.motion, thing.points)
-            for view, found in zip(views, thing.registrations, strict=True)
+            transform_points(view.to_world @ found.motion, thing.points) if shown else None
+            for view, found, shown in zip(views, thing.registrations, thing.shown, strict=True)
         ]
         for thing in things
     ]
@@ -251,9 +261,9 @@ def _weights(
         relevant = relevances(places, trajectories)
         if relevant.any():
             return relevant
-    sizes = np.array([len(points[0]) for points in places], dtype=np.float64)
+    sizes = np.array([len(thing.points) for thing in things], dtype=np.float64)
     weights = 1 + sizes / (1e3 * sizes.max())  # equal, but with too few keypoints the largest come first
-    scenery = np.array([still(points) for points in places])
+    scenery = np.array([still([one for one in points if one is not None]) for points in places])
     return weights if scenery.all() else np.where(scenery, weights * SCENERY_WEIGHT, weights)
 
 

@@ -28,7 +28,9 @@ from robust_instant_policy.perception.matching import (
 )
 from robust_instant_policy.perception.models import (
     IN_REFERENCE,
+    MIN_FITNESS,
     NO_MOTIONS,
+    SAME_THING_FITNESS,
     Model,
     Registration,
     RigidObject,
@@ -36,8 +38,8 @@ from robust_instant_policy.perception.models import (
     similarity_in,
     template_of,
 )
-from robust_instant_policy.perception.parts import MIN_GAIN, candidate_parts, gain
-from robust_instant_policy.perception.pieces import UNRELATED
+from robust_instant_policy.perception.parts import MIN_GAIN, UNEXPLAINED_M, candidate_parts, gain, surface_distances
+from robust_instant_policy.perception.pieces import STRIP_M, UNRELATED
 from robust_instant_policy.perception.registration import COLOUR_CAP_M, KEPT_COLOUR_CAP_M, refine, refine_pose
 from robust_instant_policy.perception.surroundings import Surroundings, grid_around, shown
 from robust_instant_policy.perception.view import View
@@ -48,8 +50,6 @@ MIN_NEAR = 0.2  # of that count, from which on the hand handles an object
 HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
 MAX_HAND_LOSS = 12.0  # of the logarithm of a motion's chance, for one place of the hand
 ALIGNMENT_ROUNDS = 3  # over all demonstrations
-MIN_FITNESS = 0.15  # of an object's registration in every demonstration
-SAME_THING_FITNESS = 0.5  # things of one kind in other colours have 0.3, in the same 0.7
 MAX_OBJECTS = 30  # with their parts
 SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
 MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
@@ -66,7 +66,7 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
     tell how a thing is turned that is grasped or pushed at the same place in all of them.
     """
     home = views[0]
-    pieces = list(home.pieces)
+    pieces = _joined(home, views[1:], seed)
     models = [Model((template_of(home, piece, seed),)) for piece in pieces]
     found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
     handled: set[int] = set()
@@ -101,7 +101,7 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
         family = (template_of(home, np.concatenate([pieces[i] for i in members]), seed),)
         models[number] = replace(models[number], family=family)
     things = [_complete(models, found, number, views, seed, handled) for number in range(len(models))]
-    if all(thing.worst_fitness < MIN_FITNESS for thing in things):  # do they have other colours in some images?
+    if not any(thing.shared for thing in things):  # do they have other colours in some images?
         models = [replace(model, colour_cap=COLOUR_CAP_M) for model in models]
         things = [_complete(models, found, number, views, seed, handled) for number in range(len(models))]
     shapes = [
@@ -112,6 +112,29 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
         _with_surroundings(_with_shapes(thing, [row[number] for row in shapes]) if varies else thing, views)
         for number, (thing, varies) in enumerate(zip(things, _vary(np.array(shapes)), strict=True))
     ]
+
+
+def _joined(home: View, views: Sequence[View], seed: int) -> list[IntArray]:
+    """The pieces of the first view; those that are near each other, and that one motion explains in the other
+    ``views``, are one: something hid what is between them.
+    """
+    pieces = sorted(home.pieces, key=len, reverse=True)
+    number = 0
+    while number < len(pieces) and views:
+        own = home.points[pieces[number]]
+        for other in pieces[number + 1 :]:
+            if cKDTree(own).query(home.points[other])[0].min() > STRIP_M:
+                continue
+            both = np.concatenate([pieces[number], other])
+            templates = (template_of(home, both, seed),)
+            motions = [register(templates, view).pose for view in views]
+            parts = (home.points[one] for one in (both, other))
+            if all(surface_distances(part, views, motions).mean() < UNEXPLAINED_M for part in parts):
+                pieces = [both if one is pieces[number] else one for one in pieces if one is not other]
+                break
+        else:
+            number += 1
+    return pieces
 
 
 def _aligned(
@@ -174,8 +197,9 @@ def _with_surroundings(thing: RigidObject, views: Sequence[View]) -> RigidObject
     """``thing`` with what the ``views`` show around it."""
     if thing.model.parent >= 0 or thing.model.surroundings is None:
         return replace(thing, model=replace(thing.model, surroundings=None))
-    motions = [one.motion for one in thing.registrations]
-    seen = Surroundings.of(thing.points, views, motions, thing.model.varies)
+    showing = np.flatnonzero(thing.shown)
+    motions = [thing.registrations[i].motion for i in showing]
+    seen = Surroundings.of(thing.points, [views[i] for i in showing], motions, thing.model.varies)
     return replace(thing, model=replace(thing.model, surroundings=seen))
 
 
@@ -230,8 +254,11 @@ def _split(
             pairs.append((rest, register(part_model.templates, view, taken, parent=rest.pose)))
             if pairs[-1][1].fitness < MIN_FITNESS:
                 break
-        fitness = [own.fitness for _, own in pairs]
-        if min(fitness) < MIN_FITNESS or np.median(fitness) < SAME_THING_FITNESS:
+        of_rest, of_part, of_whole = ([one.fitness for one in row] for row in (*zip(*pairs, strict=True), found))
+        if min(of_part) < MIN_FITNESS or np.median(of_part) < SAME_THING_FITNESS:
+            continue
+        # Two motions explain the images better than one, or the part follows noise.
+        if part.mean() * np.mean(of_part) + (1 - part.mean()) * np.mean(of_rest) < np.mean(of_whole):
             continue
         share, metres = gain(home.points[piece[part]], views, motions, [own.pose for _, own in pairs])
         # Not the largest share, which half of the part has as well as all of it.
@@ -265,7 +292,8 @@ def _complete(
             grown = [*models[:number], replace(model, templates=tuple(templates)), *models[number + 1 :]]
             registrations[i] = register_model(grown, number, views[i], found[i], taken, start)
         others = explained(models, found[i], [k for k in range(len(models)) if k != number])
-        templates += another_template(views[i], registrations[i], templates, others, seed)
+        if registrations[i].fitness >= MIN_FITNESS:
+            templates += another_template(views[i], registrations[i], templates, others, seed)
     return RigidObject(replace(model, templates=tuple(templates)), tuple(registrations))
 
 
