@@ -13,7 +13,6 @@ from robust_instant_policy.geometry import FloatArray, fit_upright, invert_pose,
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 from robust_instant_policy.perception.matching import (
     CLAIM_M,
-    EVIDENCE_SCALE,
     MAX_PART_TRAVEL_M,
     MAX_RIVAL_LOSS,
     RIVAL_SCALE,
@@ -40,8 +39,8 @@ from robust_instant_policy.perception.models import (
 )
 from robust_instant_policy.perception.parts import MIN_GAIN, UNEXPLAINED_M, candidate_parts, gain, surface_distances
 from robust_instant_policy.perception.pieces import STRIP_M, UNRELATED
-from robust_instant_policy.perception.registration import COLOUR_CAP_M, KEPT_COLOUR_CAP_M, refine, refine_pose
-from robust_instant_policy.perception.surroundings import Surroundings, grid_around, shown
+from robust_instant_policy.perception.registration import COLOUR_CAP_M, KEPT_COLOUR_CAP_M, horizontal_axes, refine, refine_pose
+from robust_instant_policy.perception.surroundings import Surroundings, grid_around, log_sizes, shown
 from robust_instant_policy.perception.view import View
 
 KEPT_COLOUR_M = 0.008  # median over images of the distance in colour, for an object that keeps its colours
@@ -66,7 +65,7 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
     tell how a thing is turned that is grasped or pushed at the same place in all of them.
     """
     home = views[0]
-    pieces = _joined(home, views[1:], seed)
+    pieces = _joined(home, views[1:], seed) if len(views) > 1 else list(home.pieces)
     models = [Model((template_of(home, piece, seed),)) for piece in pieces]
     found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
     handled: set[int] = set()
@@ -118,23 +117,20 @@ def _joined(home: View, views: Sequence[View], seed: int) -> list[IntArray]:
     """The pieces of the first view; those that are near each other, and that one motion explains in the other
     ``views``, are one: something hid what is between them.
     """
-    pieces = sorted(home.pieces, key=len, reverse=True)
-    number = 0
-    while number < len(pieces) and views:
-        own = home.points[pieces[number]]
-        for other in pieces[number + 1 :]:
-            if cKDTree(own).query(home.points[other])[0].min() > STRIP_M:
+    pieces = list(home.pieces)
+    for number in np.argsort([-len(piece) for piece in pieces], kind="stable"):
+        for other in range(len(pieces)):
+            one, two = pieces[number], pieces[other]
+            if other == number or not 0 < len(two) <= len(one):
                 continue
-            both = np.concatenate([pieces[number], other])
+            if cKDTree(home.points[one]).query(home.points[two])[0].min() > STRIP_M:
+                continue
+            both = np.concatenate([one, two])
             templates = (template_of(home, both, seed),)
             motions = [register(templates, view).pose for view in views]
-            parts = (home.points[one] for one in (both, other))
-            if all(surface_distances(part, views, motions).mean() < UNEXPLAINED_M for part in parts):
-                pieces = [both if one is pieces[number] else one for one in pieces if one is not other]
-                break
-        else:
-            number += 1
-    return pieces
+            if all(surface_distances(home.points[part], views, motions).mean() < UNEXPLAINED_M for part in (both, two)):
+                pieces[number], pieces[other] = both, both[:0]
+    return [piece for piece in pieces if len(piece)]
 
 
 def _aligned(
@@ -167,13 +163,20 @@ def _aligned(
         options.append(stretched(model, poses[-1], view) if stretch else poses[-1])
         priors.append(prior[kept])
     cells, grid = grid_around(points)
+    axes = horizontal_axes(points)[:2, :2]
     states = [shown(cells, view, motions) for view, motions in zip(views, options, strict=True)]
+    sizes = [log_sizes(axes, motions) for motions in options]
+
+    def agreed(which: Sequence[int]) -> Surroundings:
+        those = (np.array([values[k][chosen[k]] for k in which]) for values in (states, sizes))
+        seen, stretches = those
+        return Surroundings.from_states(cells, grid, seen, stretch, axes, stretches)
+
     chosen = [0] * len(views)
     for turn in range(ALIGNMENT_ROUNDS):
         for i in range(1, len(views)):
-            others = np.array([states[k][chosen[k]] for k in range(len(views)) if k < i or (k > i and turn)])
-            seen = Surroundings.from_states(cells, grid, others, stretch)
-            chosen[i] = int((priors[i] + seen.evidence_in(states[i]) / EVIDENCE_SCALE).argmax())
+            others = agreed([k for k in range(len(views)) if k < i or (k > i and turn)])
+            chosen[i] = int((priors[i] + others.log_chance_of(states[i], sizes[i])).argmax())
     known = model.templates[0].xyzrgb
     typical = np.median([_colour_difference(known, views[i], poses[i][chosen[i]]) for i in range(1, len(views))])
     if typical < KEPT_COLOUR_M:
@@ -189,8 +192,7 @@ def _aligned(
             )
             one = Registration(pose, fitness, similar, one.template)
         aligned.append(one)
-    agreed = np.array([states[k][chosen[k]] for k in range(len(views))])
-    return aligned, replace(model, surroundings=Surroundings.from_states(cells, grid, agreed, stretch))
+    return aligned, replace(model, surroundings=agreed(range(len(views))))
 
 
 def _with_surroundings(thing: RigidObject, views: Sequence[View]) -> RigidObject:
