@@ -22,7 +22,7 @@ from robust_instant_policy.perception.nearest import Image, SharedDescriptors, s
 from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.objects import find_objects, segmentation, without
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
-from robust_instant_policy.perception.relevance import hand_places, relevances, shares, still
+from robust_instant_policy.perception.relevance import hand_places, reference, relevances, shares, still
 from robust_instant_policy.perception.selection import best_buddies, select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
 from robust_instant_policy.perception.view import Hands, View, make_view
@@ -73,8 +73,8 @@ class KeypointExtractor:
     `perception.nearest`), which uses no workspace. Deterministic for a ``seed``.
 
     After `fit`: ``keypoints_ (I, K, 3)`` metres, world, ``pixels_ (I, K, 2)`` (u, v) and ``confidence_ (I, K)`` in
-    [0, 1] of I demonstrations; ``left_out_ (I,)``, those that do not show an object that has keypoints: these are
-    guessed there; ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``object_of_ (K,)``, the number of each
+    [0, 1] of I demonstrations; ``left_out_ (I,)``, those that do not show an object with keypoints, which are guessed
+    there; ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``object_of_ (K,)``, the number of each
     keypoint's; ``segmentations_``, see `segmentation`; ``notes_`` for the user, one line each.
     """
 
@@ -131,13 +131,20 @@ class KeypointExtractor:
             )
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
-        objects = find_objects(views, self.seed, hand_places(views, trajectories) if trajectories else None)
+        order = np.arange(len(views))  # exchanges the first with the reference, and back
+        hands = None
+        if trajectories is not None:
+            hands = hand_places(views, trajectories)
+            first = reference(views, hands)
+            order[0], order[first] = first, 0
+            views, trajectories, hands = [views[i] for i in order], [trajectories[i] for i in order], hands[order]
+        objects = find_objects(views, self.seed, hands)
         self.objects_ = without(objects, [not thing.shared for thing in objects])
         if not self.objects_:
             best = max((one.shown.sum() for one in objects), default=0)
             raise KeypointError(
-                f"the images have nothing in common: no object of the first is well recognised in most others (the best "
-                f"is found in {best} of {len(views)}); do all demonstrations show the same object?"
+                f"the images have nothing in common: the best object of one of them is recognised in {best} of "
+                f"{len(views)}; do all demonstrations show the same object?"
             )
         weights = _weights(self.objects_, views, trajectories)
         counts = shares(weights, self.num_keypoints)
@@ -153,12 +160,14 @@ class KeypointExtractor:
             )
             self._places.append(points)
             notes += replaced
-        found = [self._locate(view, [t.registrations[i] for t in self.objects_]) for i, view in enumerate(views)]
+        registrations = [[thing.registrations[i] for thing in self.objects_] for i in order]
+        views = [views[i] for i in order]
+        found = [self._locate(*pair) for pair in zip(views, registrations, strict=True)]
         self.keypoints_ = np.stack([located.keypoints for located in found])
         self.pixels_ = np.stack([located.pixels for located in found])
         self.confidence_ = np.stack([located.confidence for located in found])
         self.object_of_ = np.repeat(np.arange(len(counts)), counts)
-        missing = ~np.array([thing.shown for thing in self.objects_])  # (O, I)
+        missing = ~np.array([thing.shown[order] for thing in self.objects_])  # (O, I)
         missing[np.array(counts) == 0] = False
         self.left_out_ = missing.any(axis=0)
         for number, i in np.argwhere(missing):
@@ -168,8 +177,7 @@ class KeypointExtractor:
             )
         models = [thing.model for thing in self.objects_]
         self.segmentations_ = tuple(
-            segmentation(models, [thing.registrations[i] for thing in self.objects_], view)
-            for i, view in enumerate(views)
+            segmentation(models, own, view) for own, view in zip(registrations, views, strict=True)
         )
         self.notes_ = tuple(notes)
         return self

@@ -211,7 +211,11 @@ def explained(
     models: Sequence[Model], found: Sequence[Registration] | Mapping[int, Registration], which: Sequence[int]
 ) -> FloatArray:
     """Points ``(N, 3)`` of the objects ``which``, where they were found."""
-    moved = [transform_points(found[i].motion, models[i].templates[found[i].template].surface) for i in which]
+    moved = [
+        transform_points(found[i].motion, models[i].templates[found[i].template].surface)
+        for i in which
+        if found[i].fitness
+    ]
     return np.concatenate([np.zeros((0, 3)), *moved])
 
 

@@ -21,6 +21,7 @@ SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
 MIN_FITNESS = 0.15  # of the registration in an image that shows the object
 SAME_THING_FITNESS = 0.5  # things of one kind in other colours have 0.3, in the same 0.7
+TYPICAL_FITNESS = 0.35  # of what is there, more than that of wrong things of about the size
 MAX_MISSING = 0.3  # share of the images in which an object may be missing that is well recognised in the others
 NO_MOTIONS = np.zeros((0, 4, 4))
 
@@ -111,8 +112,10 @@ class RigidObject:
         shown = self.shown
         if shown.all():
             return True
-        typical = np.median([one.fitness for one in self.registrations[1:]])
-        return bool((~shown).mean() <= MAX_MISSING and typical >= SAME_THING_FITNESS)
+        if (~shown).mean() > MAX_MISSING:
+            return False
+        typical = np.median([one.fitness for one, seen in zip(self.registrations, shown, strict=True) if seen][1:])
+        return bool(typical >= TYPICAL_FITNESS)
 
 
 def template_of(home: View, piece: IntArray, seed: int) -> Template:

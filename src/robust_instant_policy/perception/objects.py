@@ -27,6 +27,7 @@ from robust_instant_policy.perception.matching import (
 )
 from robust_instant_policy.perception.models import (
     IN_REFERENCE,
+    MAX_MISSING,
     MIN_FITNESS,
     NO_MOTIONS,
     SAME_THING_FITNESS,
@@ -39,7 +40,13 @@ from robust_instant_policy.perception.models import (
 )
 from robust_instant_policy.perception.parts import MIN_GAIN, UNEXPLAINED_M, candidate_parts, gain, surface_distances
 from robust_instant_policy.perception.pieces import STRIP_M, UNRELATED
-from robust_instant_policy.perception.registration import COLOUR_CAP_M, KEPT_COLOUR_CAP_M, horizontal_axes, refine, refine_pose
+from robust_instant_policy.perception.registration import (
+    COLOUR_CAP_M,
+    KEPT_COLOUR_CAP_M,
+    horizontal_axes,
+    refine,
+    refine_pose,
+)
 from robust_instant_policy.perception.surroundings import Surroundings, grid_around, log_sizes, shown
 from robust_instant_policy.perception.view import View
 
@@ -48,6 +55,8 @@ HAND_REACH_M = 0.05  # of an object's points, at which a place of the hand count
 MIN_NEAR = 0.2  # of that count, from which on the hand handles an object
 HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
 MAX_HAND_LOSS = 12.0  # of the logarithm of a motion's chance, for one place of the hand
+GONE = 0.3  # of the greatest loss, for an object that is not where the hand takes it,
+HELD = 0.1  # if the hand takes it there in most demonstrations
 ALIGNMENT_ROUNDS = 3  # over all demonstrations
 MAX_OBJECTS = 30  # with their parts
 SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
@@ -154,10 +163,7 @@ def _aligned(
             ).motions
         rivals = alternatives(model, one, view, by_hand)
         prior = (rivals.score - rivals.score.max()) / RIVAL_SCALE
-        back = np.linalg.inv(rivals.motions)
-        moved = hands[number] @ np.swapaxes(back[:, :3, :3], 1, 2) + back[:, None, :3, 3]
-        squares = ((moved - hands[0]) ** 2).sum(axis=2) / (2 * HAND_SPREAD_M**2)
-        prior = prior - np.minimum(squares, MAX_HAND_LOSS) @ near
+        prior = prior - _hand_loss(rivals.motions, hands[0], hands[number], near)
         kept = np.union1d(0, np.flatnonzero(prior > prior.max() - 2 * MAX_RIVAL_LOSS))
         poses.append(rivals.motions[kept])
         options.append(stretched(model, poses[-1], view) if stretch else poses[-1])
@@ -192,7 +198,23 @@ def _aligned(
             )
             one = Registration(pose, fitness, similar, one.template)
         aligned.append(one)
+    if near.max() > MIN_NEAR:
+        pairs = zip(aligned, hands, strict=True)
+        loss = np.array([_hand_loss(one.pose[None], hands[0], places, near)[0] for one, places in pairs])
+        gone = loss > GONE * MAX_HAND_LOSS * near.sum()
+        if gone.mean() <= MAX_MISSING and np.median(loss) < HELD * MAX_HAND_LOSS * near.sum():
+            aligned = [replace(one, fitness=0.0) if lost else one for one, lost in zip(aligned, gone, strict=True)]
     return aligned, replace(model, surroundings=agreed(range(len(views))))
+
+
+def _hand_loss(motions: FloatArray, shown: FloatArray, hands: FloatArray, near: FloatArray) -> FloatArray:
+    """By how much places ``hands (E, 3)`` of the hand in an image speak against an object's ``motions (C, 4, 4)``: of
+    the logarithm of the chance ``(C,)``. ``shown (E, 3)`` are those in the reference image, which are ``near (E,)`` it.
+    """
+    back = np.linalg.inv(motions)
+    moved = hands @ np.swapaxes(back[:, :3, :3], 1, 2) + back[:, None, :3, 3]
+    squares = ((moved - shown) ** 2).sum(axis=2) / (2 * HAND_SPREAD_M**2)
+    return np.asarray(np.minimum(squares, MAX_HAND_LOSS) @ near)
 
 
 def _with_surroundings(thing: RigidObject, views: Sequence[View]) -> RigidObject:
@@ -284,6 +306,8 @@ def _complete(
     templates = list(model.templates)
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
         rank = [(k in handled and one.fitness > SAME_THING_FITNESS, one.score) for k, one in enumerate(found[i])]
+        if number in handled and not registrations[i].fitness:
+            continue
         better = [k for k in range(len(models)) if rank[k] > rank[number]]
         taken = explained(models, found[i], better)
         start = registrations[i].pose[None]

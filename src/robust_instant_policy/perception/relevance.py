@@ -54,6 +54,16 @@ def hand_places(views: Sequence[View], trajectories: Sequence[Trajectory]) -> Fl
     return _corresponding(places)
 
 
+def reference(views: Sequence[View], hands: FloatArray) -> int:
+    """Number of the demonstration whose image the objects are taken from: the first, unless nothing is there where the
+    hand (`hand_places`) takes something in most of the others.
+    """
+    distances = np.array([cKDTree(view.points).query(places)[0] for view, places in zip(views, hands, strict=True)])
+    taken = distances[:, np.median(distances, axis=0).argmin()]
+    typical = float(np.median(taken))
+    return 0 if taken[0] < max(CONTACT_M, 2 * typical) else int(np.flatnonzero(taken <= typical)[0])
+
+
 def _corresponding(events: Sequence[FloatArray]) -> FloatArray:
     """``(I, E, 3)``: the last events of all demonstrations correspond: a repeated attempt comes before them."""
     common = min(len(one) for one in events)

@@ -32,8 +32,8 @@ MAX_SIZE_LOSS = 6.0  # of the logarithm of the chance, for one axis
 class Surroundings:
     """``evidence_of (3, n)``: for each of n ``cells (n, 2)``, horizontal places in the reference image's world, metres,
     the logarithm of the chance of its state in an image (see `view.Ground`) against that of a coin; whether the motions
-    in the images include changes of size, ``stretch``; the object's horizontal ``axes (2, 2)`` as rows, and the mean and
-    the deviation ``sizes (2, 2)`` of the logarithms of the factors by which it is larger along them.
+    in the images include changes of size, ``stretch``; the object's horizontal ``axes (2, 2)`` as rows, and the median
+    and the deviation ``sizes (2, 2)`` of the logarithms of the factors by which it is larger along them.
     """
 
     cells: FloatArray
