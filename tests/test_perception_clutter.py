@@ -316,3 +316,38 @@ def test_of_two_alike_things_the_one_at_the_hand_is_the_grasped_one(first):
     of_grasped = found[:, found[0] == 0]
     assert of_grasped.shape[1] >= 3
     assert not of_grasped.any()
+
+
+@pytest.mark.parametrize(("demonstration", "kind"), [(3, "missing"), (2, "recoloured"), (0, "missing")])
+def test_a_demonstration_without_the_grasped_thing_is_left_out_and_told(demonstration, kind):
+    scenes = [blocks_at(seed, halves=(0.04, 0.03)) for seed in range(6)]
+    paths = [path_to(*blocks[1][:2]) for blocks in scenes]
+    shown = [list(blocks) for blocks in scenes]
+    *place, _ = shown[demonstration].pop()
+    if kind == "recoloured":
+        shown[demonstration].append((*place, ((150, 40, 200), (250, 140, 20))))
+    images = [photograph(blocks) for blocks in shown]
+    extractor = KeypointExtractor(6, features="efficientnet").fit(images[:5], paths[:5])
+    assert np.flatnonzero(extractor.left_out_).tolist() == [demonstration]
+    assert any(note.startswith(f"demonstration {demonstration} is left out") for note in extractor.notes_)
+    known = owners(extractor.pixels_[1], images[1], scenes[1])
+    assert known.count(1) >= 3
+    assert owners(extractor.locate(images[5]).pixels, images[5], scenes[5]) == known
+
+
+def test_a_thing_that_a_rod_cuts_in_two_colours_in_the_first_image_is_one_thing():
+    """Each half has its own colour, so that only their motion tells that they are one."""
+
+    def scene(seed: int, rod: bool):
+        x, y = places(seed, 1)[0]
+        halves = [(x + side, y, 0.018, 0.05, (COLOURS[0][k],) * 2) for k, side in enumerate((-0.02, 0.02))]
+        hidden = [(x * 0.7 / 0.95, y + at, 0.006, 0.3, ((15, 15, 15),) * 2) for at in np.arange(-0.5, 0.6, 0.01)]
+        return halves, photograph([*halves, *(hidden if rod else [])], size=256)
+
+    scenes = [scene(seed, seed == 0) for seed in range(5)]
+    extractor = KeypointExtractor(features="efficientnet").fit([image for _, image in scenes[:4]])
+    assert len(extractor.objects_) == 1
+    halves, image = scenes[4]
+    moved = np.subtract(halves[0][:2], scenes[0][0][0][:2])
+    errors = np.linalg.norm(extractor.locate(image).keypoints[:, :2] - extractor.keypoints_[0, :, :2] - moved, axis=1)
+    assert errors.max() < 0.02

@@ -131,7 +131,7 @@ class KeypointExtractor:
             )
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
-        order = np.arange(len(views))  # exchanges the first with the reference, and back
+        order = list(range(len(views)))  # exchanges the first with the reference, and back
         hands = None
         if trajectories is not None:
             hands = hand_places(views, trajectories)
@@ -141,10 +141,10 @@ class KeypointExtractor:
         objects = find_objects(views, self.seed, hands)
         self.objects_ = without(objects, [not thing.shared for thing in objects])
         if not self.objects_:
-            best = max((one.shown.sum() for one in objects), default=0)
+            best = max((min(one.fitness for one in thing.registrations) for thing in objects), default=0.0)
             raise KeypointError(
-                f"the images have nothing in common: the best object of one of them is recognised in {best} of "
-                f"{len(views)}; do all demonstrations show the same object?"
+                f"the images have nothing in common: the best object of one of them has a fitness of {best:.2f} in the "
+                f"worst other image (needed: {MIN_FITNESS:.2f}); do all demonstrations show the same object?"
             )
         weights = _weights(self.objects_, views, trajectories)
         counts = shares(weights, self.num_keypoints)

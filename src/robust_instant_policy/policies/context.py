@@ -27,13 +27,13 @@ HARDLY_RECOGNISED = "the scene was hardly recognised; is everything there that w
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What every method over keypoints starts from, made from ``demonstrations``.
+    """What every method over keypoints starts from, made from N ``demonstrations``.
 
-    ``keypoints (I, K, 3)``, metres, world, and ``pixels (I, K, 2)`` (u, v) of the I demonstrations (no pixels, and no
-    ``extractor``, where the keypoints were given); their downsampled ``trajectories``; the ``prompt`` that serialises
-    both; the ``report`` of what was checked; the ``surroundings`` of the gripper; ``prediction_errors (I, S)`` in
-    metres, see `leave_one_out`; ``notes`` for the user, one line each; the ``pace`` of demonstrations whose rate is
-    known.
+    ``keypoints (I, K, 3)``, metres, world, and downsampled ``trajectories`` of those I that show all objects with
+    keypoints; ``pixels (N, K, 2)`` (u, v) of all (no pixels, and no ``extractor``, where the keypoints were given); the
+    ``prompt`` that serialises both; the ``report`` of what was checked; the ``surroundings`` of the
+    gripper; ``prediction_errors (I, S)`` in metres, see `leave_one_out`; ``notes`` for the user, one line each; the
+    ``pace`` of demonstrations whose rate is known.
     """
 
     demonstrations: tuple[Demonstration, ...]
@@ -87,8 +87,10 @@ def build_context(
     report.raise_if_wrong()
     progress("keypoints", 0, 0)
     extractor = _extractor(demonstrations, settings)
-    observations = [one.observation for one in demonstrations]
-    given = _context(extractor.keypoints_, [one.trajectory for one in demonstrations], settings, observations)
+    kept = [i for i, left_out in enumerate(extractor.left_out_) if not left_out]
+    shown = [demonstrations[i] for i in kept]
+    trajectories, observations = [one.trajectory for one in shown], [one.observation for one in shown]
+    given = _context(extractor.keypoints_[kept], trajectories, settings, observations)
     return replace(
         given,
         demonstrations=tuple(demonstrations),
@@ -164,5 +166,6 @@ def locate(context: Context, observation: Observation, progress: Progress = no_p
     with watch.stage("keypoints"):
         findings = context.report.require_observation(observation)
         located = context.extractor.locate(observation)
-    recognised = recognition(context.extractor.confidence_, located.confidence)
+    extractor = context.extractor
+    recognised = recognition(extractor.confidence_[~extractor.left_out_], located.confidence)
     return LocatedScene(located, watch.stages[0], findings, View.of(observation), recognised)
