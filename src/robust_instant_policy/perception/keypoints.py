@@ -8,7 +8,7 @@ from functools import wraps
 from typing import ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from robust_instant_policy.demonstration import Observation
@@ -169,7 +169,7 @@ class KeypointExtractor:
         self.object_of_ = np.repeat(np.arange(len(counts)), counts)
         missing = ~np.array([thing.shown[order] for thing in self.objects_])  # (O, I)
         missing[np.array(counts) == 0] = False
-        self.left_out_ = missing.any(axis=0)
+        self.left_out_: NDArray[np.bool_] = np.asarray(missing.any(axis=0))
         for number, i in np.argwhere(missing):
             notes.append(
                 f"demonstration {i} is left out: object {number}, which has keypoints, is missing there, hidden, or of "

@@ -221,7 +221,7 @@ def _with_surroundings(thing: RigidObject, views: Sequence[View]) -> RigidObject
     """``thing`` with what the ``views`` show around it."""
     if thing.model.parent >= 0 or thing.model.surroundings is None:
         return replace(thing, model=replace(thing.model, surroundings=None))
-    showing = np.flatnonzero(thing.shown)
+    showing = np.flatnonzero(thing.shown).tolist()
     motions = [thing.registrations[i].motion for i in showing]
     seen = Surroundings.of(thing.points, [views[i] for i in showing], motions, thing.model.varies)
     return replace(thing, model=replace(thing.model, surroundings=seen))
