@@ -16,7 +16,7 @@ from robust_instant_policy.errors import InvalidValueError, KeypointError, Unkno
 from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
-from robust_instant_policy.perception.matching import certainty, find_again, register_all
+from robust_instant_policy.perception.matching import certainty, find_again, plausibility, register_all
 from robust_instant_policy.perception.models import MIN_FITNESS, Registration, RigidObject
 from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
@@ -146,7 +146,7 @@ class KeypointExtractor:
                 f"the images have nothing in common: the best object of one of them has a fitness of {best:.2f} in the "
                 f"worst other image (needed: {MIN_FITNESS:.2f}); do all demonstrations show the same object?"
             )
-        weights = _weights(self.objects_, views, trajectories)
+        weights = _weights(self.objects_, views, trajectories) * [thing.typical_fitness for thing in self.objects_]
         counts = shares(weights, self.num_keypoints)
         if (left := int(((weights > 0) & (np.array(counts) == 0)).sum())) > 0:
             notes.append(
@@ -231,7 +231,8 @@ class KeypointExtractor:
         expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
         points, pixels, measured = lift_to_surface(view.observation, view.depth, expected)
         counts = [len(places) for places in self._places]
-        confidence = np.repeat([found.fitness * found.similarity for found in registrations], counts)
+        quality = [found.fitness * found.similarity * plausibility(t.model, found, view) for t, _, found in triples]
+        confidence = np.repeat(quality, counts)
         confidence *= np.concatenate(
             [certainty(t.model, found, view, places) for t, places, found in triples if len(places)]
         )

@@ -46,6 +46,7 @@ FEW_CELLS = 40  # of an object's descriptors, below which all votes may be wrong
 QUARTER_TURNS = np.deg2rad([0.0, 90.0, 180.0, 270.0])  # of an object at a piece of its size
 PIECE_SIZES = 2.5  # factor between the surfaces of an object and of a piece that may be it
 REACHED_M = 0.03  # by a voted motion, from which ICP starts
+UNUSUAL_STRETCH = 0.3  # logarithm of a change of size, for a confidence of 1/e
 MUCH_BETTER = 0.05  # of the score, by which an object's own registration overrules that with its parts
 MAX_PART_TRAVEL_M = 0.2  # against its object
 MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one,
@@ -315,6 +316,15 @@ def _decided(model: Model, found: Registration, view: View) -> Registration:
         rivals=rivals.motions[kept[order[1:]]],
         shares=shares / shares.sum(),
     )
+
+
+def plausibility(model: Model, found: Registration, view: View) -> float:
+    """In [0, 1]: less where an object would have another size than in the reference image, or other surroundings than
+    in the demonstrations. A wrong turn often needs both.
+    """
+    stretch = np.abs(np.log(np.linalg.eigvalsh(found.shape[:3, :3]))).max()
+    likeness = 1.0 if model.surroundings is None else model.surroundings.likeness(view, found.motion)
+    return float(np.exp(-((stretch / UNUSUAL_STRETCH) ** 2)) * likeness)
 
 
 def certainty(model: Model, found: Registration, view: View, points: FloatArray) -> FloatArray:

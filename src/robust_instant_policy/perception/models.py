@@ -114,8 +114,13 @@ class RigidObject:
             return True
         if (~shown).mean() > MAX_MISSING:
             return False
-        typical = np.median([one.fitness for one, seen in zip(self.registrations, shown, strict=True) if seen][1:])
-        return bool(typical >= TYPICAL_FITNESS)
+        return self.typical_fitness >= TYPICAL_FITNESS
+
+    @property
+    def typical_fitness(self) -> float:
+        """Median over the images that show it, but the reference image: how well it can be recognised."""
+        shown = [one.fitness for one in self.registrations if one.fitness >= MIN_FITNESS]
+        return float(np.median(shown[1:] or shown))
 
 
 def template_of(home: View, piece: IntArray, seed: int) -> Template:

@@ -8,7 +8,7 @@ size between images also have typical sizes along their two horizontal axes: a w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ LEAST_CHANCE = 0.12  # that a cell is not as in all images before
 EVIDENCE_SCALE = 8.0  # neighbouring cells of the grid are not independent
 PRIOR_DEVIATION = 0.12  # of the logarithm of a size, before any image,
 PRIOR_IMAGES = 2  # that counts like this many
+LEAST_DEVIATION = 2.0  # of the logarithm of the chance, added to that over the images
+UNUSUAL_DEVIATIONS = 3.0  # below what is usual, for a confidence of 1/e
 MAX_SIZE_LOSS = 6.0  # of the logarithm of the chance, for one axis
 
 
@@ -33,7 +35,8 @@ class Surroundings:
     """``evidence_of (3, n)``: for each of n ``cells (n, 2)``, horizontal places in the reference image's world, metres,
     the logarithm of the chance of its state in an image (see `view.Ground`) against that of a coin; whether the motions
     in the images include changes of size, ``stretch``; the object's horizontal ``axes (2, 2)`` as rows, and the median
-    and the deviation ``sizes (2, 2)`` of the logarithms of the factors by which it is larger along them.
+    and the deviation ``sizes (2, 2)`` of the logarithms of the factors by which it is larger along them; the same,
+    ``usual (2,)``, of `log_chance` in the images, where it is known.
     """
 
     cells: FloatArray
@@ -41,6 +44,7 @@ class Surroundings:
     stretch: bool
     axes: FloatArray
     sizes: FloatArray
+    usual: FloatArray | None = None
 
     @classmethod
     def of(
@@ -50,7 +54,10 @@ class Surroundings:
         cells, shape = grid_around(points)
         axes = horizontal_axes(points)[:2, :2]
         states = np.array([shown(cells, view, motion[None])[0] for view, motion in zip(views, motions, strict=True)])
-        return cls.from_states(cells, shape, states, stretch, axes, log_sizes(axes, np.array(motions)))
+        sizes = log_sizes(axes, np.array(motions))
+        seen = cls.from_states(cells, shape, states, stretch, axes, sizes)
+        chances = seen.log_chance_of(states, sizes)[1:]  # the first is the reference image
+        return replace(seen, usual=np.stack([np.median(chances), robust_std(chances)])) if len(chances) else seen
 
     @classmethod
     def from_states(
@@ -78,6 +85,13 @@ class Surroundings:
         (C, 4, 4)``.
         """
         return self.log_chance_of(shown(self.cells, view, motions), log_sizes(self.axes, motions))
+
+    def likeness(self, view: View, motion: FloatArray) -> float:
+        """In [0, 1], less the more `log_chance` at ``motion (4, 4)`` is below what is usual."""
+        if self.usual is None:
+            return 1.0
+        lack = self.usual[0] - float(self.log_chance(view, motion[None])[0])
+        return float(np.exp(-max(lack, 0) / (UNUSUAL_DEVIATIONS * (self.usual[1] + LEAST_DEVIATION))))
 
     def log_chance_of(self, states: NDArray[np.int8], sizes: FloatArray) -> FloatArray:
         """The same of ``states (C, n)`` of the cells and `log_sizes` ``(C, 2)``."""
