@@ -2,14 +2,16 @@
 
     python benchmarks/perception.py accuracy             # against the simulator's truth, all tasks
     python benchmarks/perception.py hard                 # the same in hard scenes, with the confidence; resumable
+    python benchmarks/perception.py missing              # one demonstration does not show the object
     python benchmarks/perception.py real DIR --out OUT   # photographs with outlines, see perception_real.py
     python benchmarks/perception.py picture              # docs/images/keypoints.jpg
     python benchmarks/perception.py speed                # ratios to one pass of the network
     python benchmarks/perception.py speed --reference CHECKOUT    # beside ShirAmir/dino-vit-features
     python benchmarks/perception.py speed --features dino --columns real      # one line of the table
 
-Writes `docs/tables/perception_accuracy.md`, `perception_hard.md` and `perception_speed.md`; keeps each scene of the
-second in `results/perception_hard.jsonl` and each line of the third in `results/perception_speed.json`.
+Writes `docs/tables/perception_accuracy.md`, `perception_hard.md`, `perception_missing.md` and `perception_speed.md`;
+keeps each scene of the second in `results/perception_hard.jsonl` and each line of the last in
+`results/perception_speed.json`.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ import numpy as np
 import torch
 from dino_reference import ReferenceTransformer, load_reference, random_checkpoint
 from perception_hard import hard
+from perception_missing import missing
 from perception_real import real
 from PIL import Image, ImageDraw
 
@@ -290,6 +293,9 @@ def main() -> None:
     harder.add_argument("--data", type=Path, default=ROOT / "data" / "hard", help="folder of the demonstrations")
     harder.add_argument("--rows", type=Path, default=ROOT / "results" / "perception_hard.jsonl")
     harder.add_argument("--table", type=Path, default=TABLES / "perception_hard.md")
+    gone = commands.add_parser("missing")
+    gone.add_argument("--scenes", type=int, default=5)
+    gone.add_argument("--data", type=Path, default=ROOT / "data" / "hard", help="folder of the demonstrations")
     commands.add_parser("picture").add_argument("--task", default="open-drawer")
     photographs = commands.add_parser("real")
     photographs.add_argument("folder", type=Path)
@@ -311,6 +317,8 @@ def main() -> None:
     elif arguments.command == "hard":
         settings = arguments.tasks, arguments.split, arguments.correspondence, arguments.scenes
         hard(*settings, arguments.data, arguments.rows, arguments.table)
+    elif arguments.command == "missing":
+        missing(arguments.data, arguments.scenes, TABLES / "perception_missing.md")
     elif arguments.command == "real":
         if not (arguments.folder / "pair.json").exists():
             parser.error(f"{arguments.folder} holds no pair.json; perception_real.py describes the folder")
