@@ -351,3 +351,19 @@ def test_a_thing_that_a_rod_cuts_in_two_colours_in_the_first_image_is_one_thing(
     moved = np.subtract(halves[0][:2], scenes[0][0][0][:2])
     errors = np.linalg.norm(extractor.locate(image).keypoints[:, :2] - extractor.keypoints_[0, :, :2] - moved, axis=1)
     assert errors.max() < 0.02
+
+
+def test_an_object_of_another_size_has_less_confidence_and_an_unusual_stretch_speaks_against_a_turn():
+    def scene(seed: int, long: float):
+        x, y = places(seed, 1)[0]
+        bar = [(x + along, y, 0.02, 0.05, COLOURS[1]) for along in np.arange(-long, long + 0.001, 0.01)]
+        return photograph(bar), path_to(x, y)
+
+    demonstrations = [scene(seed, 0.04) for seed in range(5)]
+    extractor = KeypointExtractor(4, features="efficientnet").fit(*map(list, zip(*demonstrations, strict=True)))
+    same, longer = (extractor.locate(scene(7, long)[0]).confidence.mean() for long in (0.04, 0.06))
+    assert longer < 0.7 * same
+    surroundings = extractor.objects_[0].model.surroundings
+    unseen = np.zeros((2, len(surroundings.cells)), dtype=np.int8)
+    usual, exchanged = surroundings.log_chance_of(unseen, np.array([[0.0, 0.0], [0.3, -0.3]]))
+    assert usual - exchanged > 3
