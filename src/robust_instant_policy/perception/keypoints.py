@@ -146,7 +146,7 @@ class KeypointExtractor:
                 f"the images have nothing in common: the best object of one of them has a fitness of {best:.2f} in the "
                 f"worst other image (needed: {MIN_FITNESS:.2f}); do all demonstrations show the same object?"
             )
-        weights = _weights(self.objects_, views, trajectories) * [thing.typical_fitness for thing in self.objects_]
+        weights = _weights(self.objects_, views, trajectories)
         counts = shares(weights, self.num_keypoints)
         if (left := int(((weights > 0) & (np.array(counts) == 0)).sum())) > 0:
             notes.append(
@@ -269,7 +269,7 @@ def _weights(
     if trajectories is not None:
         relevant = relevances(places, trajectories)
         if relevant.any():
-            return relevant
+            return relevant * np.array([thing.typical_fitness for thing in things])
     sizes = np.array([len(thing.points) for thing in things], dtype=np.float64)
     weights = 1 + sizes / (1e3 * sizes.max())  # equal, but with too few keypoints the largest come first
     scenery = np.array([still([one for one in points if one is not None]) for points in places])
