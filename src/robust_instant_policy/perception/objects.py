@@ -174,9 +174,8 @@ def _aligned(
     sizes = [log_sizes(axes, motions) for motions in options]
 
     def agreed(which: Sequence[int]) -> Surroundings:
-        those = (np.array([values[k][chosen[k]] for k in which]) for values in (states, sizes))
-        seen, stretches = those
-        return Surroundings.from_states(cells, grid, seen, stretch, axes, stretches)
+        seen, own = (np.array([values[k][chosen[k]] for k in which]) for values in (states, sizes))
+        return Surroundings.from_states(cells, grid, seen, stretch, axes, own)
 
     chosen = [0] * len(views)
     for turn in range(ALIGNMENT_ROUNDS):
