@@ -56,12 +56,19 @@ def hand_places(views: Sequence[View], trajectories: Sequence[Trajectory]) -> Fl
 
 def reference(views: Sequence[View], hands: FloatArray) -> int:
     """Number of the demonstration whose image the objects are taken from: the first, unless nothing is there where the
-    hand (`hand_places`) takes something in most of the others.
+    hand (`hand_places`) takes something in most of the others; then the one that shows most there.
     """
     distances = np.array([cKDTree(view.points).query(places)[0] for view, places in zip(views, hands, strict=True)])
-    taken = distances[:, np.median(distances, axis=0).argmin()]
+    event = int(np.median(distances, axis=0).argmin())
+    taken = distances[:, event]
     typical = float(np.median(taken))
-    return 0 if taken[0] < max(CONTACT_M, 2 * typical) else int(np.flatnonzero(taken <= typical)[0])
+    if taken[0] < max(CONTACT_M, 2 * typical):
+        return 0
+    near = [
+        np.linalg.norm(view.points - places[event], axis=1) < 2 * CONTACT_M
+        for view, places in zip(views, hands, strict=True)
+    ]
+    return int(np.argmax([which.sum() * (distance <= typical) for which, distance in zip(near, taken, strict=True)]))
 
 
 def _corresponding(events: Sequence[FloatArray]) -> FloatArray:
