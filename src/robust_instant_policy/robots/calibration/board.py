@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from robust_instant_policy.errors import CalibrationError, InvalidValueError, MissingExtraError
+from robust_instant_policy.errors import CalibrationError, InvalidValueError, MissingExtraError, RobotError
 from robust_instant_policy.geometry import FloatArray
 
 MIN_CORNERS = 8  # of a board in an image
@@ -155,9 +155,11 @@ class Board:
 
 
 def opencv() -> Any:
-    """The module ``cv2``; raises `MissingExtraError` where it is not installed."""
+    """The module ``cv2``; raises `MissingExtraError` or `RobotError` where it cannot be imported."""
     try:
         import cv2
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingExtraError("OpenCV", "robots") from None
+    except ImportError as error:
+        raise RobotError(f"OpenCV cannot be loaded: {error}; on Debian: apt install libgl1") from None
     return cv2

@@ -164,11 +164,13 @@ class RealSenseCamera:
 
 
 def sdk() -> Any:
-    """The module ``pyrealsense2``; raises `MissingExtraError` where it is not installed."""
+    """The module ``pyrealsense2``; raises `MissingExtraError` or `RobotError` where it cannot be imported."""
     try:
         import pyrealsense2
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingExtraError("pyrealsense2", "robots") from None
+    except ImportError as error:
+        raise RobotError(f"pyrealsense2 cannot be loaded: {error}; on Debian: apt install libusb-1.0-0") from None
     return pyrealsense2
 
 
