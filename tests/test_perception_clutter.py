@@ -6,10 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.geometry import GripperTriangle, make_pose, project
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.perception.view import make_view
+from robust_instant_policy.policies.context import build_context
+from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.trajectory import Trajectory
 
@@ -367,3 +369,19 @@ def test_an_object_of_another_size_has_less_confidence_and_an_unusual_stretch_sp
     unseen = np.zeros((2, len(surroundings.cells)), dtype=np.int8)
     usual, exchanged = surroundings.log_chance_of(unseen, np.array([[0.0, 0.0], [0.3, -0.3]]))
     assert usual - exchanged > 3
+
+
+def test_the_context_holds_the_demonstrations_that_show_the_grasped_thing():
+    scenes = [blocks_at(seed, halves=(0.04, 0.03)) for seed in range(6)]
+    shown = [list(blocks) for blocks in scenes]
+    shown[3][1] = (*scenes[3][1][:4], ((150, 40, 200), (250, 140, 20)))
+    demonstrations = [
+        Demonstration(photograph(blocks), path_to(*scene[1][:2]), 10.0)
+        for blocks, scene in zip(shown, scenes, strict=True)
+    ]
+    context = build_context(demonstrations, Settings(features="efficientnet"))
+    assert len(context.keypoints) == len(context.trajectories) == len(demonstrations) - 1
+    assert len(context.pixels) == len(demonstrations)
+    assert np.isin(
+        demonstrations[4].trajectory.actions[-1, :3].round(3), context.trajectories[3].actions.round(3)
+    ).all()
