@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from robust_instant_policy.context import Prompt, leave_one_out, write_prompt
-from robust_instant_policy.context.alignment import align
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
@@ -88,18 +87,9 @@ def build_context(
     progress("keypoints", 0, 0)
     extractor = _extractor(demonstrations, settings)
     kept = [i for i, left_out in enumerate(extractor.left_out_) if not left_out]
-    shown = [demonstrations[i] for i in kept]
-    trajectories, observations = [one.trajectory for one in shown], [one.observation for one in shown]
-    given = _context(extractor.keypoints_[kept], trajectories, settings, observations)
-    return replace(
-        given,
-        demonstrations=tuple(demonstrations),
-        extractor=extractor,
-        pixels=extractor.pixels_,
-        report=report,
-        pace=Pace.of(demonstrations),
-        notes=(*extractor.notes_, *report.notes, *given.notes),
-    )
+    trajectories = [demonstrations[i].trajectory for i in kept]
+    observations = [demonstrations[i].observation for i in kept]
+    return _context(extractor.keypoints_[kept], trajectories, settings, report, observations, demonstrations, extractor)
 
 
 def _extractor(demonstrations: Sequence[Demonstration], settings: Settings) -> KeypointExtractor | OwnKeypoints:
@@ -120,31 +110,38 @@ def context_of_keypoints(keypoints: FloatArray, trajectories: Sequence[Trajector
 
     There are no images to check; a plan is still held against the envelope of ``trajectories``.
     """
-    return _context(keypoints, trajectories, settings)
+    report = SetReport((), Envelope.of(trajectories, HORIZONTAL), None)
+    return _context(keypoints, trajectories, settings, report)
 
 
 def _context(
     keypoints: FloatArray,
     trajectories: Sequence[Trajectory],
     settings: Settings,
+    report: SetReport,
     observations: Sequence[Observation] = (),
+    demonstrations: Sequence[Demonstration] = (),
+    extractor: KeypointExtractor | OwnKeypoints | None = None,
 ) -> Context:
-    """What keypoints, trajectories and, where there are any, ``observations`` of demonstrations give."""
+    """Thin the ``trajectories`` out and serialise them; with their ``observations`` and all ``demonstrations`` where
+    there is more than these.
+    """
     thinned = tuple(downsample(one, settings.downsampling, settings.num_steps) for one in trajectories)
     prompt = write_prompt(keypoints, thinned, settings.frames, settings.layout)
-    aligned = align(thinned)
+    aligned = prompt.aligned
     views = [View.of(observations[index]) for index in aligned.kept] if observations else []
     return Context(
-        (),
-        None,
+        tuple(demonstrations),
+        extractor,
         keypoints,
-        np.zeros((len(keypoints), 0, 2)),
+        np.zeros((len(keypoints), 0, 2)) if extractor is None else extractor.pixels_,
         thinned,
         prompt,
-        SetReport((), Envelope.of(trajectories, HORIZONTAL), None),
+        report,
         Surroundings.of(views, aligned.actions),
-        leave_one_out(keypoints, thinned, prompt),
-        prompt.notes(),
+        leave_one_out(prompt),
+        (*(() if extractor is None else extractor.notes_), *report.notes, *prompt.notes()),
+        Pace.of(demonstrations) if demonstrations else None,
     )
 
 
