@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from robust_instant_policy.checks import checked_array, checked_pose
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.files import open_regular, write_whole
-from robust_instant_policy.geometry import FloatArray, as_numbers
+from robust_instant_policy.geometry import FloatArray, as_numbers, lift
 from robust_instant_policy.trajectory import Trajectory
 
 FARTHEST_CAMERA_M = 50.0  # from the origin of the world; farther, it is not in metres
@@ -66,6 +66,15 @@ class Observation:
         ):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
+
+    def points(self, most: int | None = None) -> tuple[FloatArray, NDArray[np.uint8]]:
+        """The points ``(N, 3)`` of all pixels with depth, metres, world, and their colours ``(N, 3)``; evenly thinned
+        out to at ``most`` so many."""
+        rows, columns = np.nonzero(self.depth > 0)
+        every = 1 if most is None else max(1, -(-len(rows) // most))
+        rows, columns = rows[::every], columns[::every]
+        pixels = np.column_stack([columns, rows])
+        return lift(pixels, self.depth[rows, columns], self.intrinsics, self.camera_pose), self.rgb[rows, columns]
 
     @classmethod
     def load(cls, path: str | Path) -> Observation:

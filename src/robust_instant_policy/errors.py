@@ -6,7 +6,8 @@ The command turns them into exit codes: 2 for wrong usage, 1 for everything else
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class RipError(Exception):
@@ -35,6 +36,17 @@ class MissingExtraError(RipError):
     def __init__(self, package: str, extra: str):
         super().__init__(f"{package} is not installed; run: {install_command(extra)}")
         self.package, self.extra = package, extra
+
+
+@contextmanager
+def needs_extra(extra: str) -> Iterator[None]:
+    """Raises `MissingExtraError` for a package that the ``with`` block imports and that is not installed."""
+    try:
+        yield
+    except ImportError as error:
+        if error.name is None or error.name.startswith("robust_instant_policy"):
+            raise
+        raise MissingExtraError(error.name, extra) from error
 
 
 def install_command(extra: str) -> str:

@@ -45,21 +45,17 @@ DIRECTIONS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(required=True, metavar="WHAT")
     usual = Board()
-    board = argparse.ArgumentParser(add_help=False)
-    board.add_argument("--columns", type=positive, default=usual.columns, help="squares (default: %(default)s)")
-    board.add_argument("--rows", type=positive, default=usual.rows, help="squares (default: %(default)s)")
-    board.add_argument(
-        "--square", type=float, default=usual.square_m, metavar="M", help="edge in metres (default: %(default)s)"
-    )
-    board.add_argument(
-        "--marker", type=float, default=usual.marker_m, metavar="M", help="edge in metres (default: %(default)s)"
-    )
-    board.add_argument("--dictionary", default=usual.dictionary, help="of the markers (default: %(default)s)")
-    cell = argparse.ArgumentParser(add_help=False)
+    board = type(parser)(add_help=False)
+    board.add_argument("--columns", type=positive, default=usual.columns, help="squares")
+    board.add_argument("--rows", type=positive, default=usual.rows, help="squares")
+    board.add_argument("--square", type=float, default=usual.square_m, metavar="M", help="edge in metres")
+    board.add_argument("--marker", type=float, default=usual.marker_m, metavar="M", help="edge in metres")
+    board.add_argument("--dictionary", default=usual.dictionary, help="of the markers")
+    cell = type(parser)(add_help=False)
     cell.add_argument("--robot", type=Path, required=True, metavar="FILE", help="file of the cell")
 
     printed = actions.add_parser("board", parents=[board], help="write the board to print")
-    printed.add_argument("--out", type=Path, default=Path("board.pdf"), help=".pdf or .png (default: %(default)s)")
+    printed.add_argument("--out", type=Path, default=Path("board.pdf"), help=".pdf or .png")
     printed.set_defaults(action=_board)
 
     camera = actions.add_parser("camera", parents=[cell, board], help="camera to world, with a printed board")
@@ -68,8 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--place", type=float, nargs=4, metavar=("X", "Y", "Z", "YAW"),
                      help="corner A of the board, metres in the world, and the direction A to B, degrees")  # fmt: skip
     how.add_argument("--in-hand", metavar="ARM", help="this arm holds the board")
-    camera.add_argument("--places", type=positive, default=6, help="of the board on the table (default: %(default)s)")
-    camera.add_argument("--poses", type=positive, default=12, help="of the board in the hand (default: %(default)s)")
+    camera.add_argument("--places", type=positive, default=6, help="of the board on the table")
+    camera.add_argument("--poses", type=positive, default=12, help="of the board in the hand")
     camera.set_defaults(action=_camera)
 
     tool = actions.add_parser("tool", parents=[cell], help="fingertips and opening of a gripper")

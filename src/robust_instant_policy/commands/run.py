@@ -11,15 +11,16 @@ from itertools import count
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import RUNS, add_method, positive
+from robust_instant_policy.commands.options import RUNS, add_method, share
 from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import StoppedError, UsageError
 from robust_instant_policy.files import make_folder, write_whole
+from robust_instant_policy.llm import model_name
 from robust_instant_policy.motion.arm import Motion
 from robust_instant_policy.motion.guard import plan_guarded
-from robust_instant_policy.policies import RobustInstantPolicy
+from robust_instant_policy.policies import KeypointPolicy
 from robust_instant_policy.policies.policy import Plan
 from robust_instant_policy.reporting.run import (
     MEASURED_FILE,
@@ -54,13 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plan", type=Path, metavar="DIR", help="execute the plan of an earlier --dry-run in this folder"
     )
-    parser.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
-    parser.add_argument("--queries", type=positive, default=5, metavar="Q", help="samples (default: %(default)s)")
     parser.add_argument("--dry-run", action="store_true", help="everything but the motion: no arm is connected")
     parser.add_argument("--yes", action="store_true", help="execute without asking")
     parser.add_argument(
         "--speed",
-        type=_share,
+        type=share(0.05),
         metavar="SHARE",
         help="of the usual speed, 0.05 to 1 (default: 1, and first_run_speed until a run in this cell ended well)",
     )
@@ -100,14 +99,15 @@ class _Planner:
     config: CellConfig
     screen: StageConsole
     demonstrations: Sequence[Demonstration]
-    policy: RobustInstantPolicy
+    policy: KeypointPolicy
+    llm: str
 
     @classmethod
     @contextmanager
     def open(cls, config: CellConfig, options: argparse.Namespace, screen: StageConsole) -> Iterator[_Planner]:
         demonstrations = load_demonstrations(options.demos)
         with fitted_policy(options, demonstrations, screen, config.limits.workspace) as policy:
-            yield cls(config, screen, demonstrations, policy)
+            yield cls(config, screen, demonstrations, policy, model_name(options.llm))
 
     def plan(self, seen: Observation, out: Path) -> RunRecord:
         """Plan for what is ``seen``; image, plan and context lie in the run folder ``out`` then."""
@@ -120,9 +120,7 @@ class _Planner:
         for note in plan.notes:
             self.screen.say(f"    {note}")
         task = self.demonstrations[0].task or self.config.name
-        return RunRecord(
-            task, task, None, self.policy.llm.name, self.policy.name, None, PLANNED, tuple(self.screen.stages)
-        )
+        return RunRecord(task, task, None, self.llm, self.policy.name, None, PLANNED, tuple(self.screen.stages))
 
 
 class _Run:
@@ -262,14 +260,3 @@ def _goes_on() -> bool:
         return _agrees("arrange the next scene; go on?")
     except StoppedError:  # the terminal was closed
         return False
-
-
-def _share(text: str) -> float:
-    """A share of the usual speed."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.05 <= value <= 1.0:
-        raise argparse.ArgumentTypeError(f"must be from 0.05 to 1, not {text!r}")
-    return value

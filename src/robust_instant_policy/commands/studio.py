@@ -8,11 +8,11 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
-from robust_instant_policy.commands.options import DATA
+from robust_instant_policy.commands.options import DATA, add_llm
 from robust_instant_policy.datasets.folder import read_recording
 from robust_instant_policy.datasets.layout import RIP_PATH
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import MissingExtraError, UsageError
+from robust_instant_policy.errors import UsageError, needs_extra
 from robust_instant_policy.llm import model_name
 from robust_instant_policy.tasks import require_task
 
@@ -27,13 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--observation", type=Path, metavar="FILE", help="a new scene (.npz) to plan for, instead of a simulator"
     )
-    parser.add_argument(
-        "--llm",
-        default="embedded",
-        help="language model: embedded, gguf:PATH, openai:MODEL or http://…#MODEL (default: %(default)s)",
-    )
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
-    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="0 for any (default: %(default)s)")
+    add_llm(parser)
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on")
+    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="0 for any")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -42,13 +38,8 @@ def run(options: argparse.Namespace) -> int:
         require_task(task)
     observation = Observation.load(options.observation) if options.observation else None
     model_name(options.llm)  # a spec that names no model is refused here, not at the first plan
-    with _undisturbed():
-        try:
-            from robust_instant_policy.studio.server import Choice, serve
-        except ModuleNotFoundError as error:
-            if error.name and error.name.startswith("robust_instant_policy"):
-                raise
-            raise MissingExtraError(error.name or "viser", "studio") from error
+    with _undisturbed(), needs_extra("studio"):
+        from robust_instant_policy.studio.server import Choice, serve
     serve(Choice(task, options.demos, DATA / "studio", options.llm, observation), options.host, options.port)
     return 0
 

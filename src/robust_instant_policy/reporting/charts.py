@@ -12,7 +12,7 @@ from plotly.subplots import make_subplots
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.policies.policy import Plan
-from robust_instant_policy.reporting.pictures import keypoint_colour, scene_points, tool_points
+from robust_instant_policy.reporting.pictures import keypoint_colour
 from robust_instant_policy.robots.path import MeasuredPath, Sweep
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
@@ -49,17 +49,14 @@ def candidate_colour(plan: Plan, index: int) -> str:
 def paths_in_space(plan: Plan, observation: Observation) -> go.Figure:
     """Paths between the fingertips in the world, candidates coloured by weight, with the gripper's axes along the
     robust one and what its fingertips sweep, over the points that the camera saw."""
-    figure = go.Figure()
-    points, colours = scene_points(observation, MAX_POINTS)
-    look = {"size": 2, "color": [f"rgb({r},{g},{b})" for r, g, b in colours]}
-    _add_points(figure, points.astype(np.float32), mode="markers", name="camera", marker=look, hoverinfo="skip")
+    figure = _seen(observation)
     for index, candidate in enumerate(plan.candidates):
         weight = np.interp(candidate.times, plan.trajectory.times, plan.weights[index])
         shade = {"color": weight, "colorscale": WEIGHT_COLOURS, "cmin": 0, "cmax": 1}
         for arm in range(candidate.num_arms):
             _add_points(
                 figure,
-                tool_points(candidate, arm),
+                candidate.tool_points[:, arm],
                 mode="lines+markers",
                 name=candidate_name(plan, index),
                 showlegend=False,
@@ -91,10 +88,7 @@ def paths_in_space(plan: Plan, observation: Observation) -> go.Figure:
 def swept_space(sweep: Sweep, observation: Observation) -> go.Figure:
     """The path between the fingertips from where the arms are parked, and the arms' links along it, pale at first and
     dark at the end, over the points that the camera saw."""
-    figure = go.Figure()
-    points, colours = scene_points(observation, MAX_POINTS)
-    look = {"size": 2, "color": [f"rgb({r},{g},{b})" for r, g, b in colours]}
-    _add_points(figure, points.astype(np.float32), mode="markers", name="camera", marker=look, hoverinfo="skip")
+    figure = _seen(observation)
     gap = np.full((*sweep.links.shape[:2], 1, 3), np.nan)  # between the lines of two links
     lines = np.concatenate([sweep.links, gap], axis=2).reshape(-1, 3)
     seconds = np.repeat(sweep.seconds, 3 * sweep.links.shape[1])
@@ -116,7 +110,7 @@ def executed_paths(plan: Plan, path: MeasuredPath) -> go.Figure:
     for arm in range(plan.trajectory.num_arms):
         first = arm == 0
         planned = {"mode": "markers", "name": "planned", "marker": {"color": ROBUST_COLOUR, "size": 3}}
-        _add_points(figure, tool_points(plan.trajectory, arm), showlegend=first, legendgroup="planned", **planned)
+        _add_points(figure, plan.trajectory.tool_points[:, arm], showlegend=first, legendgroup="planned", **planned)
         for points, name, colour in (
             (path.commanded_tools, "commanded", CANDIDATE_COLOURS[0]),
             (path.measured_tools, "measured", HALLUCINATED_COLOUR),
@@ -124,6 +118,15 @@ def executed_paths(plan: Plan, path: MeasuredPath) -> go.Figure:
             look = {"mode": "lines", "line": {"color": colour, "width": 4}, "legendgroup": name}
             _add_points(figure, points[:, arm], name=name, showlegend=first, **look)
     return _in_space(figure)
+
+
+def _seen(observation: Observation) -> go.Figure:
+    """The points that the camera saw."""
+    figure = go.Figure()
+    points, colours = observation.points(MAX_POINTS)
+    look = {"size": 2, "color": [f"rgb({r},{g},{b})" for r, g, b in colours]}
+    _add_points(figure, points.astype(np.float32), mode="markers", name="camera", marker=look, hoverinfo="skip")
+    return figure
 
 
 def _in_space(figure: go.Figure) -> go.Figure:
@@ -146,7 +149,7 @@ def _add_points(figure: go.Figure, points: FloatArray, **look: Any) -> None:
 def _add_robust_path(figure: go.Figure, plan: Plan, arm: int) -> None:
     _add_points(
         figure,
-        tool_points(plan.trajectory, arm),
+        plan.trajectory.tool_points[:, arm],
         mode="lines+markers",
         name="robust trajectory",
         legendgroup="robust",

@@ -16,7 +16,6 @@ from robust_instant_policy.reporting.pictures import (
     Picture,
     picture,
     svg_points,
-    tool_points,
 )
 from robust_instant_policy.reporting.tables import NONE, Table
 from robust_instant_policy.sanity import Finding, SetReport, errors
@@ -103,7 +102,7 @@ def _picture(observation: Observation, caption: str, demonstration: Demonstratio
     if demonstration is not None:
         scale = width / REFERENCE_WIDTH
         for arm in range(demonstration.trajectory.num_arms):
-            points = svg_points(tool_points(demonstration.trajectory, arm), observation)
+            points = svg_points(demonstration.trajectory.tool_points[:, arm], observation)
             lines.append(Line(points, PATH_COLOUR, 1.2 * scale, title="middle of the fingertips"))
         marks = _grasps(GripperPath.of(demonstration.trajectory).closings, observation)
     return picture(rgb.astype(np.uint8), caption, lines, marks)

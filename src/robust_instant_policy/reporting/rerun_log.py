@@ -23,7 +23,6 @@ from robust_instant_policy.errors import MissingExtraError, RipError, UsageError
 from robust_instant_policy.files import PART_SUFFIX, excerpt, make_folder, require_replaceable
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.policy import Plan
-from robust_instant_policy.reporting.pictures import scene_points
 from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_FILE
 from robust_instant_policy.robots.path import MeasuredPath
 from robust_instant_policy.trajectory import Trajectory
@@ -178,7 +177,7 @@ def _log_observation(recording: rr.RecordingStream, observation: Observation) ->
     )
     recording.log("world/camera/rgb", rr.Image(observation.rgb))
     recording.log("world/camera/depth", rr.DepthImage(np.nan_to_num(observation.depth), meter=1.0))
-    points, colours = scene_points(observation, MAX_POINTS)
+    points, colours = observation.points(MAX_POINTS)
     recording.log("world/points", rr.Points3D(points, colors=colours, radii=POINT_M))
 
 
@@ -188,7 +187,7 @@ def _log_candidate(recording: rr.RecordingStream, index: int, candidate: Traject
 
     is_ignored = bool(plan.hallucinated[index])
     name = f"candidate {index + 1}" + (f", hallucinated from step {plan.onset[index]}" if is_ignored else "")
-    tips = _tips(candidate)
+    tips = candidate.tool_points
     pieces = np.stack([tips[:-1], tips[1:]], axis=2).reshape(-1, 2, 3)  # (steps · arms, 2, 3)
     steps = np.linspace(0, 1, max(len(tips) - 1, 1))
     weights = np.interp(steps, plan.trajectory.times, plan.weights[index]).repeat(candidate.num_arms)
@@ -208,7 +207,7 @@ def _log_path(recording: rr.RecordingStream, path: str, trajectory: Trajectory, 
     """The way between the fingertips, in one colour where the gripper is open and in another where it is closed."""
     import rerun as rr
 
-    tips = _tips(trajectory)
+    tips = trajectory.tool_points
     pieces = np.stack([tips[:-1], tips[1:]], axis=2).reshape(-1, 2, 3)
     closed = trajectory.gripper_state[:-1].ravel() > 0.5
     colours = np.where(closed[:, None], CLOSED, OPEN).astype(np.uint8)
@@ -223,11 +222,6 @@ def _log_steps(recording: rr.RecordingStream, path: str, trajectory: Trajectory)
         recording.set_time("step", sequence=step)
         colours = [CLOSED if closed > 0.5 else OPEN for closed in state]
         recording.log(path, rr.LineStrips3D(arms[:, [1, 0, 2]], colors=colours, radii=PATH_M))
-
-
-def _tips(trajectory: Trajectory) -> FloatArray:
-    """Points midway between the fingertips ``(T, A, 3)``."""
-    return trajectory.triplets[:, :, 1:].mean(axis=2)
 
 
 def _blueprint() -> Any:

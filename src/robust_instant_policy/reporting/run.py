@@ -38,7 +38,6 @@ from robust_instant_policy.reporting.pictures import (
     keypoint_marks,
     picture,
     svg_points,
-    tool_points,
 )
 from robust_instant_policy.reporting.tables import NONE, Table
 from robust_instant_policy.robots.path import MeasuredPath, Sweep
@@ -174,7 +173,7 @@ def _candidates_over_scene(observation: Observation, plan: Plan) -> Picture:
 
     def lines(trajectory: Trajectory, colour: str, width: float, dash: str = "", title: str = "") -> list[Line]:
         return [
-            Line(svg_points(tool_points(trajectory, arm), observation), colour, width * unit, dash, title)
+            Line(svg_points(trajectory.tool_points[:, arm], observation), colour, width * unit, dash, title)
             for arm in range(trajectory.num_arms)
         ]
 

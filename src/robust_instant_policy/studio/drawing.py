@@ -14,7 +14,7 @@ from PIL import Image
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import Plan
 from robust_instant_policy.studio.cell import Surface
-from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
+from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
 MAX_TEXTURE_PIXELS = 512
 ROUGHNESS = 0.75
@@ -82,11 +82,6 @@ def _image(texture: np.ndarray) -> Image.Image:
     return image
 
 
-def tool_path(trajectory: Trajectory, arm: int) -> FloatArray:
-    """Midpoints ``(T, 3)`` between the fingertips, metres."""
-    return trajectory.triplets[:, arm, 1:].mean(axis=1)
-
-
 def polyline(points: FloatArray) -> FloatArray:
     """The segments ``(T - 1, 2, 3)`` between ``points (T, 3)``."""
     return np.stack([points[:-1], points[1:]], axis=1)
@@ -101,7 +96,7 @@ def weighed(plan: Plan, index: int, arm: int) -> tuple[FloatArray, np.ndarray]:
     weight = np.interp(candidate.times, plan.trajectory.times, plan.weights[index])
     share = np.clip(weight, 0, 1)[:, None]
     colours = (share * FOLLOWED + (1 - share) * IGNORED).astype(np.uint8)
-    segments, steps = polyline(tool_path(candidate, arm)), np.arange(len(candidate) - 1)
+    segments, steps = polyline(candidate.tool_points[:, arm]), np.arange(len(candidate) - 1)
     shown = np.ones(len(steps), dtype=bool)
     if plan.hallucinated[index]:
         shown = (steps < plan.onset[index]) | (steps // DASH % 2 == 0)

@@ -11,7 +11,7 @@ import viser
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.geometry import FloatArray, lift, make_pose
+from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.studio import drawing
 from robust_instant_policy.studio.cell import Cell, Surface
 
@@ -91,12 +91,8 @@ class Stage:
             self._points.remove()
             self._points = None
         if observation is not None:
-            rows, columns = np.nonzero(np.nan_to_num(observation.depth) > 0)
-            pixels = np.stack([columns, rows], axis=1)
-            depth = observation.depth[rows, columns]
-            points = lift(pixels, depth, observation.intrinsics, observation.camera_pose)
             self._points = self.scene.add_point_cloud(
-                "/seen", points, observation.rgb[rows, columns], point_size=POINT_M, precision="float32"
+                "/seen", *observation.points(), point_size=POINT_M, precision="float32"
             )
 
     def _show_body(self, name: str, surfaces: Sequence[Surface]) -> None:
