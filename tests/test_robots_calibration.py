@@ -224,7 +224,7 @@ def test_touching_a_point_with_both_fingers_gives_the_tool_frame_and_the_opening
     assert result.opening == pytest.approx(0.07, abs=0.001)
     assert max(result.left_out_mm) < 2.0
     result.save(tmp_path / "gripper.toml")
-    assert read_gripper(tmp_path / "gripper.toml").length == pytest.approx(0.1567, abs=0.001)
+    assert read_gripper(tmp_path / "gripper.toml")[0].length == pytest.approx(0.1567, abs=0.001)
 
 
 def test_touches_that_do_not_determine_the_tip_are_told():

@@ -16,7 +16,7 @@ from robust_instant_policy.geometry import GripperTriangle, invert_pose, make_po
 from robust_instant_policy.robots.calibration import Board, CameraCalibration, in_hand, on_table, touched_place
 from robust_instant_policy.robots.calibration.guided import Guide, photograph_places
 from robust_instant_policy.robots.camera import Frame
-from robust_instant_policy.robots.cell import CellConfig, read_gripper, read_tool
+from robust_instant_policy.robots.cell import CellConfig, read_gripper
 from robust_instant_policy.robots.leaders import make_leader
 from robust_instant_policy.robots.models import arm_of
 from robust_instant_policy.robots.operator import ENTER
@@ -259,7 +259,8 @@ def test_the_command_measures_a_gripper_by_touching_a_point_with_both_fingers(tm
     try:
         out = tmp_path / "gripper.toml"
         assert main(["calibrate", "tool", "--robot", str(cell.file), "--out", str(out)]) == 0, capsys.readouterr().err
-        assert read_gripper(out).opening == pytest.approx(2 * TRAVEL, abs=0.002)  # the encoders' steps are 0.8 mm here
-        np.testing.assert_allclose(read_tool(out)[:3, 3], TIP[:3, 3], atol=0.002)
+        gripper, tool = read_gripper(out)
+        assert gripper.opening == pytest.approx(2 * TRAVEL, abs=0.002)  # the encoders' steps are 0.8 mm here
+        np.testing.assert_allclose(tool[:3, 3], TIP[:3, 3], atol=0.002)
     finally:
         cell.unplug()

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from tokenize import TokenError
 from types import MappingProxyType
+from typing import BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
@@ -58,12 +59,7 @@ class Observation:
         camera_pose = checked_pose("camera_pose", self.camera_pose)
         if np.abs(camera_pose[:3, 3]).max() > FARTHEST_CAMERA_M:
             raise InvalidValueError(f"camera_pose puts the camera at {camera_pose[:3, 3]}; is that in metres?")
-        for name, value in (
-            ("rgb", rgb),
-            ("depth", depth),
-            ("intrinsics", intrinsics),
-            ("camera_pose", camera_pose),
-        ):
+        for name, value in zip(ARRAYS, (rgb, depth, intrinsics, camera_pose), strict=True):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
 
@@ -83,27 +79,36 @@ class Observation:
         What the file declares is checked before memory is reserved for it; nothing is unpickled.
         """
         try:
-            with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-                missing = [name for name in ARRAYS if f"{name}.npy" not in archive.namelist()]
-                if missing:
-                    raise DatasetError(
-                        f"{path} lacks {', '.join(missing)}; an observation is an .npz with {', '.join(ARRAYS)}"
-                    )
-                return cls(*(_read_array(archive, name) for name in ARRAYS))
+            with open_regular(path) as file:
+                return cls.read(file, path)
         except FileNotFoundError:
             raise DatasetError(f"no observation at {path}") from None
+
+    @classmethod
+    def read(cls, file: BinaryIO, name: str | Path) -> Observation:
+        """`load` from an open ``.npz`` file, called ``name`` in errors."""
+        try:
+            with zipfile.ZipFile(file) as archive:
+                missing = [array for array in ARRAYS if f"{array}.npy" not in archive.namelist()]
+                if missing:
+                    raise DatasetError(
+                        f"{name} lacks {', '.join(missing)}; an observation is an .npz with {', '.join(ARRAYS)}"
+                    )
+                return cls(*(_read_array(archive, array) for array in ARRAYS))
         except InvalidValueError as error:
-            raise DatasetError(f"{path}: {error}") from None
+            raise DatasetError(f"{name}: {error}") from None
         except UNREADABLE_NPZ:
-            raise DatasetError(f"{path} is not an .npz file with {', '.join(ARRAYS)}") from None
+            raise DatasetError(f"{name} is not an .npz file with {', '.join(ARRAYS)}") from None
 
     def save(self, path: str | Path) -> None:
         """Write the observation as an ``.npz`` file that `load` reads."""
+        write_whole(Path(path), self.npz())
+
+    def npz(self) -> bytes:
+        """The content of such a file."""
         buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer, rgb=self.rgb, depth=self.depth, intrinsics=self.intrinsics, camera_pose=self.camera_pose
-        )
-        write_whole(Path(path), buffer.getvalue())
+        np.savez_compressed(buffer, **{name: getattr(self, name) for name in ARRAYS})
+        return buffer.getvalue()
 
 
 def _check_intrinsics(intrinsics: FloatArray, height: int, width: int) -> None:

@@ -33,6 +33,7 @@ from robust_instant_policy.reporting.run import (
 )
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.device import connected
 from robust_instant_policy.robots.emulation.client import Emulation, devices_of
 from robust_instant_policy.robots.execution import (
     has_open_grippers,
@@ -217,12 +218,8 @@ class _Run:
         if self._config.camera is None:
             raise UsageError(f"{self._config.path} has no table [camera]")
         camera = make_camera(self._config.camera, self._config.path.parent)
-        with self._screen.stage(f"image of camera {camera.name}"):
-            camera.connect()
-            try:
-                return observe(self._config, camera)
-            finally:
-                camera.disconnect()
+        with self._screen.stage(f"image of camera {camera.name}"), connected(camera):
+            return observe(self._config, camera)
 
     def _outcome(self, played: Played) -> tuple[bool | None, str]:
         """Whether the task is done, None where only a person can say, and the outcome in words."""

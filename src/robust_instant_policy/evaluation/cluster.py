@@ -14,7 +14,7 @@ from typing import Any, cast
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
-from robust_instant_policy.errors import MissingExtraError, UsageError
+from robust_instant_policy.errors import UsageError, needs_extra
 from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.work import Outcome, SceneWork, Setup
 from robust_instant_policy.evaluation.workbench import Workbench
@@ -37,10 +37,8 @@ class RayWorkers:
 
         Raises `MissingExtraError` without Ray, and `UsageError` if there is no cluster at the address.
         """
-        try:
+        with needs_extra("distributed"):
             import ray
-        except ModuleNotFoundError as error:
-            raise MissingExtraError("ray", "distributed") from error
         own = {"include_dashboard": False} if self.address == "local" else {}
         try:
             ray.init(address=self.address, log_to_driver=False, logging_level="warning", **own)

@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import MissingExtraError, RipError, UsageError
+from robust_instant_policy.errors import RipError, UsageError, needs_extra
 from robust_instant_policy.files import PART_SUFFIX, excerpt, make_folder, require_replaceable
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.policy import Plan
@@ -48,10 +48,8 @@ def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
     Raises `UsageError` for anything else, `MissingExtraError` without Rerun, `RipError` where no viewer answers and
     where the file cannot be written.
     """
-    try:
+    with needs_extra("rerun"):
         import rerun as rr
-    except ImportError as error:
-        raise MissingExtraError("rerun-sdk", "rerun") from error
     recording = rr.RecordingStream("robust-instant-policy")
     try:
         part = _send_to(recording, where)

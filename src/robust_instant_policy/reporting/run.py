@@ -259,7 +259,7 @@ def _execution_table(path: MeasuredPath) -> Table:
     """How far the measured path is from the commanded one, for each arm."""
     rows = []
     for arm in range(path.tool_errors.shape[1]):
-        errors, joints = path.tool_errors[:, arm], np.abs(path.commanded - path.measured)[:, arm, :-1]
+        errors, joints = path.tool_errors[:, arm], path.joint_errors[:, arm]
         if len(errors):
             rows.append(
                 (

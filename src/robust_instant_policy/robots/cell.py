@@ -300,21 +300,12 @@ def read_camera_pose(path: Path) -> FloatArray:
     return pose
 
 
-def read_gripper(path: Path) -> GripperTriangle:
-    """``length`` and ``opening``, metres, of a gripper's file; other keys are the calibration's own."""
-    return _gripper(read_section(path))
-
-
-def read_tool(path: Path) -> FloatArray | None:
-    """``tool (4, 4)`` of a gripper's file, measured tool -> tool of the arm's model; None without it."""
+def read_gripper(path: Path) -> tuple[GripperTriangle, FloatArray | None]:
+    """``length`` and ``opening``, metres, of a gripper's file, and its ``tool (4, 4)``, measured tool -> tool of the
+    arm's model, None without it; other keys are the calibration's own."""
     section = read_section(path)
-    return section.pose("tool") if "tool" in section else None
-
-
-def _gripper(section: Section) -> GripperTriangle:
-    return GripperTriangle(
-        section.number("length", least=0.002, most=1.0), section.number("opening", least=0.002, most=0.5)
-    )
+    length, opening = (section.number(key, least=0.002, most=most) for key, most in (("length", 1.0), ("opening", 0.5)))
+    return GripperTriangle(length, opening), section.pose("tool") if "tool" in section else None
 
 
 def _limits(cell: Section) -> Limits:
@@ -363,7 +354,7 @@ def _arm(section: Section, path: Path) -> ArmConfig:
                 "take the key out until rip calibrate tool has written it; an arm of your own needs length and opening"
             )
             raise section.error("gripper", f"is wrong, there is no file at {file}: {words}, metres, by a ruler first")
-        gripper, tool = read_gripper(file), read_tool(file)
+        gripper, tool = read_gripper(file)
     config = ArmConfig(
         name=name,
         model=section.text("model"),

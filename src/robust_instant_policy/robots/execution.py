@@ -37,11 +37,10 @@ def observe(config: CellConfig, camera: Camera) -> Observation:
         raise RobotError(f"camera {camera.name} repeats its image: it is frozen; unplug it, plug it in, and run again")
     if config.camera_calibration is not None:
         check_camera(config.camera_calibration, camera.name, frame)
-    share = float((np.isfinite(frame.depth) & (frame.depth > 0)).mean())
-    if share < MIN_DEPTH_SHARE:
+    if frame.depth_share < MIN_DEPTH_SHARE:
         raise RobotError(
-            f"camera {camera.name}: {100 * share:.0f}% of the pixels have depth, at least {100 * MIN_DEPTH_SHARE:.0f}% "
-            "are needed; uncover it, or move it farther away"
+            f"camera {camera.name}: {100 * frame.depth_share:.0f}% of the pixels have depth, at least "
+            f"{100 * MIN_DEPTH_SHARE:.0f}% are needed; uncover it, or move it farther away"
         )
     return Observation(frame.rgb, frame.depth, frame.intrinsics, config.camera_pose)
 

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from robust_instant_policy.robots.follower import ArmState, Command
+from robust_instant_policy.motion.state import ArmState, Command
+from robust_instant_policy.robots.device import Device
 
 
-class Leader(Protocol):
-    """Commands one follower. The methods raise `RobotError` when the device does not answer."""
-
-    name: str
-
-    def connect(self) -> None: ...
+class Leader(Device, Protocol):
+    """Commands one follower."""
 
     def start(self) -> None:
         """Called before leading begins: where the leader was before does not matter."""
@@ -25,5 +22,3 @@ class Leader(Protocol):
         the state of the ``follower``.
         """
         ...
-
-    def disconnect(self) -> None: ...

@@ -97,19 +97,14 @@ class MeasuredPath:
         return cls(float(arrays.pop("rate_hz")), **arrays)
 
     @property
-    def worst_following_error(self) -> float:
-        """Largest difference, rad, between a commanded and a measured joint."""
-        return float(np.abs(self.commanded - self.measured)[..., :-1].max(initial=0.0))
+    def joint_errors(self) -> FloatArray:
+        """Differences ``(N, A, J)``, rad, between commanded and measured joints."""
+        return np.abs(self.commanded - self.measured)[..., :-1]
 
     @property
     def tool_errors(self) -> FloatArray:
         """Distances ``(N, A)``, metres, between commanded and measured tools."""
         return np.linalg.norm(self.commanded_tools - self.measured_tools, axis=-1)
-
-    @property
-    def jitter(self) -> FloatArray:
-        """Deviation ``(N - 1,)``, seconds, of the time between two commands from that of the rate."""
-        return np.abs(np.diff(self.seconds) - 1 / self.rate_hz)
 
     def empty_grasps(self, names: Sequence[str]) -> list[str]:
         """One line for each time that a gripper closed and held nothing."""

@@ -147,9 +147,9 @@ def guide(station: Station, leaders: Sequence[Leader | None], operator: Operator
     return following.key
 
 
-def jitter(episode: Episode, rate_hz: float) -> FloatArray:
-    """Deviation ``(T - 1,)``, seconds, of the time between two steps from that of the rate."""
-    return np.abs(np.diff(episode.seconds) - 1 / rate_hz)
+def jitter_95_ms(seconds: FloatArray, rate_hz: float) -> float:
+    """95th percentile, milliseconds, of the deviation of steps at ``seconds (T,)`` from the period of the rate."""
+    return 1e3 * float(np.percentile(np.abs(np.diff(seconds) - 1 / rate_hz), 95))
 
 
 def demonstration_of(
@@ -172,7 +172,7 @@ def demonstration_of(
     facts: dict[str, str | float | int] = {
         "cell": cell,
         "calibration": episode.calibration,
-        "jitter_95_ms": round(1e3 * float(np.percentile(jitter(episode, rate_hz), 95)), 2),
+        "jitter_95_ms": round(jitter_95_ms(episode.seconds, rate_hz), 2),
     }
     return Demonstration(episode.start, trajectory, rate_hz, task, seed, facts)
 

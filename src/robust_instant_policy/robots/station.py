@@ -13,7 +13,6 @@ import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from robust_instant_policy.motion.gate import STALE_S, Gate
 from robust_instant_policy.motion.guard import minimum_jerk
 from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.device import connected
 from robust_instant_policy.robots.follower import Follower
 from robust_instant_policy.robots.followers import make_follower
 from robust_instant_policy.robots.models import arm_of
@@ -94,14 +94,11 @@ class Station:
     def __enter__(self) -> Station:
         with contextlib.ExitStack() as stack:
             for follower in self.followers:
-                follower.connect()
-                stack.callback(follower.disconnect)
+                stack.enter_context(connected(follower))
             self._connected = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._connected:
             self.stop()
 

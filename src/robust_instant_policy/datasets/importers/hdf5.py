@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robust_instant_policy.errors import DatasetError, MissingExtraError
+from robust_instant_policy.errors import DatasetError, needs_extra
 from robust_instant_policy.files import excerpt, open_regular, parse_json
 
 MAX_ARRAY_BYTES = 2**32  # of one array; the images of an episode are the largest
@@ -21,10 +21,8 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     """The open ``h5py.File``. Raises `DatasetError` for a missing or damaged file, also while it is read, and for
     one with links, because an external link refers to another file.
     """
-    try:
+    with needs_extra("import"):
         import h5py
-    except ImportError as error:
-        raise MissingExtraError("h5py", "import") from error
     try:
         open_regular(path).close()
         with h5py.File(path, "r") as file:

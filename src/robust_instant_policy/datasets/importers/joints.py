@@ -12,7 +12,7 @@ import numpy as np
 
 from robust_instant_policy.checks import checked_pose, checked_positive
 from robust_instant_policy.datasets.importers.layouts import MAX_ANGLE_RAD, arm_of
-from robust_instant_policy.errors import DatasetError, MissingExtraError
+from robust_instant_policy.errors import DatasetError, needs_extra
 from robust_instant_policy.files import excerpt, read_regular
 from robust_instant_policy.geometry import FloatArray
 
@@ -46,11 +46,9 @@ class JointModel:
         """Poses ``(T, 4, 4)`` of the link for ``values (T, D)`` in columns called ``names``, of one ``arm`` of two
         ("left", "right"). Raises `DatasetError`.
         """
-        try:
+        with needs_extra("robots"):
             import mink
             import mujoco
-        except ImportError as error:
-            raise MissingExtraError(error.name or "mink", "robots") from error
         model = _load(mujoco, self.urdf)
         if not _has(mujoco, model, self.link):
             links = ", ".join(model.body(index).name for index in range(1, model.nbody))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from robust_instant_policy.errors import CalibrationError, InvalidValueError, MissingExtraError
+from robust_instant_policy.errors import CalibrationError, InvalidValueError, needs_extra
 from robust_instant_policy.geometry import FloatArray
 
 MIN_CORNERS = 8  # of a board in an image
@@ -156,8 +156,6 @@ class Board:
 
 def opencv() -> Any:
     """The module ``cv2``; raises `MissingExtraError` where it is not installed."""
-    try:
+    with needs_extra("robots"):
         import cv2
-    except ImportError:
-        raise MissingExtraError("OpenCV", "robots") from None
     return cv2

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from robust_instant_policy.errors import RobotError
-from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.robots.calibration.board import Board, BoardView
 from robust_instant_policy.robots.calibration.board_pose import (
@@ -22,7 +20,7 @@ from robust_instant_policy.robots.calibration.board_pose import (
 )
 from robust_instant_policy.robots.calibration.hand_eye import calibrate_hand_eye
 from robust_instant_policy.robots.calibration.table import BoardPlace, calibrate_on_table
-from robust_instant_policy.robots.calibration.toml import toml
+from robust_instant_policy.robots.calibration.toml import now, save_calibration
 from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cell import read_section
 
@@ -67,7 +65,7 @@ class CameraCalibration:
         }
         if self.depth_scale is not None:
             facts["depth_scale"] = round(self.depth_scale, 5)
-        write_whole(path, (HEADER + toml(facts) + "\n[board]\n" + toml(asdict(self.board))).encode())
+        save_calibration(path, HEADER, facts, board=asdict(self.board))
 
     @classmethod
     def load(cls, path: Path) -> CameraCalibration:
@@ -172,5 +170,5 @@ def _facts(seen: Sequence[_Seen], frame: Frame, board: Board) -> dict[str, Any]:
         "reprojection_px": float(np.sqrt(np.mean([one.error_px**2 for one in seen]))),
         "depth_scale": float(np.median(scales)) if scales else None,
         "board": board,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "date": now(),
     }

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from robust_instant_policy.errors import MissingExtraError, RobotError
+from robust_instant_policy.errors import RobotError, needs_extra
 from robust_instant_policy.robots.calibration.board import opencv
 from robust_instant_policy.robots.camera import Frame, check_alive
 
@@ -165,10 +165,8 @@ class RealSenseCamera:
 
 def sdk() -> Any:
     """The module ``pyrealsense2``; raises `MissingExtraError` where it is not installed."""
-    try:
+    with needs_extra("robots"):
         import pyrealsense2
-    except ImportError:
-        raise MissingExtraError("pyrealsense2", "robots") from None
     return pyrealsense2
 
 

@@ -9,12 +9,10 @@ from __future__ import annotations
 import io
 import json
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -78,10 +76,7 @@ def _handler(shared: SharedTwin, devices: Mapping[str, Device]) -> type[BaseHTTP
         def do_GET(self) -> None:
             try:
                 if self.path == "/observation.npz":
-                    with tempfile.TemporaryDirectory() as folder:
-                        file = Path(folder) / "observation.npz"
-                        shared.photograph().save(file)
-                        self._send(200, file.read_bytes())
+                    self._send(200, shared.photograph().npz())
                 elif self.path in ("/commands.npy", "/times.npy"):
                     buffer = io.BytesIO()
                     np.save(buffer, shared.commands if self.path == "/commands.npy" else shared.times)

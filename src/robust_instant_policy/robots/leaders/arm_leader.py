@@ -9,23 +9,18 @@ import numpy as np
 from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.state import ArmState, Command
+from robust_instant_policy.robots.device import Device
 from robust_instant_policy.robots.leaders.joint_map import JointMap
 
 MAX_STEP_RAD = 1.0  # between two readings; a servo that restarted jumps by more
 
 
-class JointSource(Protocol):
-    """A device with S angles. The methods raise `RobotError` when it does not answer."""
-
-    name: str
-
-    def connect(self) -> None: ...
+class JointSource(Device, Protocol):
+    """A device with S angles."""
 
     def angles(self) -> FloatArray:
         """Readings ``(S,)`` rad."""
         ...
-
-    def disconnect(self) -> None: ...
 
 
 class ArmLeader:
