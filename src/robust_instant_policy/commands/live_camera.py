@@ -9,7 +9,6 @@ So neither pictures nor keypoints take time of the process that commands the arm
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import multiprocessing
 import os
@@ -24,10 +23,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from numpy.typing import NDArray
-from PIL import Image
-
 from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.datasets.images import encode_image
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import RipError, RobotError
 from robust_instant_policy.geometry import FloatArray
@@ -164,7 +161,7 @@ def _work(wire: Connection, camera: VideoCamera, page: _Page) -> None:
             continue
         began = time.monotonic()
         try:
-            page.live = _jpeg(camera.preview())
+            page.live = encode_image(camera.preview(), "jpeg", quality=JPEG_QUALITY)
             page.error = ""
         except Exception as error:  # of whatever library: the camera may be read all the same
             page.error = str(error)
@@ -239,9 +236,3 @@ def _handler(page: _Page) -> type[BaseHTTPRequestHandler]:
             """Write nothing to the terminal: the operator reads it."""
 
     return Handler
-
-
-def _jpeg(rgb: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(rgb).save(buffer, format="jpeg", quality=JPEG_QUALITY)
-    return buffer.getvalue()

@@ -11,6 +11,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from robust_instant_policy.datasets.layout import REPAIR
 from robust_instant_policy.demonstration import MAX_PIXELS
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.files import open_regular, write_whole
@@ -79,7 +80,9 @@ class VideoEncoder:
 
 
 class VideoWriter:
-    """Writes a video to ``path`` atomically when closed; without images, an existing file is removed.
+    """Writes a video to ``path`` at the end of the ``with`` block; without images, an existing file is removed.
+
+    Raises `DatasetError` where it cannot be written.
 
     >>> with VideoWriter("run.mp4", fps=20) as video:
     ...     task.execute(trajectory, on_frame=video.add)
@@ -94,10 +97,6 @@ class VideoWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Write the file. Raises `DatasetError` if that is not possible."""
         content = self._encoder.finish()
         if content:
             write_whole(self._path, content)
@@ -132,7 +131,7 @@ def decode_video(
                 if frame.time >= stop_s - half_frame:
                     return
                 if (frame.width, frame.height) != (stream.width, stream.height):
-                    raise DatasetError(f"{path} holds images of several sizes: restore it, or record the folder again")
+                    raise DatasetError(f"{path} holds images of several sizes: {REPAIR}")
                 if frame.time >= start_s - half_frame:
                     yield frame.to_ndarray(format=pixel_format)
     # Of what a damaged file lacks, PyAV gives None, or an attribute that is not there.
@@ -140,4 +139,4 @@ def decode_video(
         OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError, MemoryError,
         RuntimeError, av.FFmpegError,
     ) as error:  # fmt: skip
-        raise DatasetError(f"{path} cannot be read as a video: restore it, or record the folder again") from error
+        raise DatasetError(f"{path} cannot be read as a video: {REPAIR}") from error

@@ -15,19 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.card import dataset_card, write_calibration
+from robust_instant_policy.datasets.card import write_calibration, write_summary
 from robust_instant_policy.datasets.folder import Folder, inside, open_folder, read_recording, read_seed
-from robust_instant_policy.datasets.images import encode_depth, encode_png
+from robust_instant_policy.datasets.images import encode_depth, encode_image
 from robust_instant_policy.datasets.statistics import Statistics, extended, feature_statistics, image_statistics
 from robust_instant_policy.datasets.tables import (
     episode_table,
     features_of,
     frame_table,
     json_file,
-    listed,
     parquet,
     read_statistics,
-    task_table,
 )
 from robust_instant_policy.datasets.video import encode_video
 from robust_instant_policy.demonstration import Demonstration
@@ -293,7 +291,7 @@ class DatasetWriter:
         """Write the start-of-episode images; returns the columns for the other data of the start."""
         observation = demonstration.observation
         depth, unit = encode_depth(observation.depth)
-        self._write_file(layout.START_RGB_PATTERN, episode, encode_png(observation.rgb))
+        self._write_file(layout.START_RGB_PATTERN, episode, encode_image(observation.rgb))
         self._write_file(layout.START_DEPTH_PATTERN, episode, depth)
         return {
             layout.INTRINSICS_COLUMN: observation.intrinsics.ravel().tolist(),
@@ -322,11 +320,7 @@ class DatasetWriter:
             "video_path": layout.VIDEO_PATTERN if layout.VIDEO_KEY in features else None,
             "features": features,
         }
-        if num_episodes == 1:
-            write_whole(self.path / layout.TASKS_PATH, parquet(task_table(self.description)))
-        write_whole(self.path / layout.CARD_PATH, dataset_card(info, self.task, self.description))
-        write_whole(self.path / layout.STATS_PATH, json_file({key: listed(value) for key, value in statistics.items()}))
-        write_whole(self.path / layout.INFO_PATH, json_file(info))
+        write_summary(self.path, info, self.task, self.description, statistics)
         return info
 
     def _write_file(self, pattern: str, episode: int, content: bytes) -> None:

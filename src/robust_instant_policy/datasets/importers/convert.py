@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ def import_demonstrations(path: str | Path, task: str, rig: Rig) -> list[Demonst
     Raises `DatasetError` for another kind of file, and for one that lacks data of a demonstration; the error
     lists all of it, and how to supply it.
     """
-    return [episode.demonstration(task, rig.triangle) for episode in _read_episodes(Path(path), rig)]
+    return [episode.on(rig).demonstration(task, rig.triangle) for episode in _open(Path(path), rig)]
 
 
 def convert_demonstrations(path: str | Path, out: str | Path, task: str, description: str, rig: Rig) -> int:
@@ -38,19 +39,16 @@ def convert_demonstrations(path: str | Path, out: str | Path, task: str, descrip
     Raises `DatasetError` as `import_demonstrations` and `DatasetWriter` do.
     """
     writer = None
-    try:
+    with ExitStack() as stack:
         there: list[Demonstration] = []
-        for episode in _read_episodes(Path(path), rig):
-            demonstration = episode.demonstration(task, rig.triangle)
+        for episode in _open(Path(path), rig):
+            demonstration = episode.on(rig).demonstration(task, rig.triangle)
             if writer is None:
-                writer = DatasetWriter(out, task, description, demonstration.rate_hz)
+                writer = stack.enter_context(DatasetWriter(out, task, description, demonstration.rate_hz))
                 there = load_demonstrations(out, task=task) if writer.num_episodes else []
             if _is_new(demonstration, there, writer.path):
                 writer.add(demonstration, None if episode.images is None else episode.images())
         return 0 if writer is None else writer.num_episodes
-    finally:
-        if writer is not None:
-            writer.close()
 
 
 def _is_new(demonstration: Demonstration, there: Iterable[Demonstration], out: Path) -> bool:
@@ -65,11 +63,6 @@ def _is_new(demonstration: Demonstration, there: Iterable[Demonstration], out: P
                 "from another file of that name; choose a new folder, or give the file another name"
             )
     return True
-
-
-def _read_episodes(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
-    for episode in _open(path, rig):
-        yield episode.on(rig)
 
 
 def _open(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
