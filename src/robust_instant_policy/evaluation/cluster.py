@@ -119,8 +119,10 @@ class _Actor:
     """A worker: a workbench in a Ray actor."""
 
     def __init__(self, setup: Setup, store: Any, shown: dict[str, Any]):
-        self._shown = shown
-        self._bench = Workbench(setup, cast(SampleStore, _DistantStore(store, setup.store)), self._demonstrations)
+        import ray
+
+        samples = cast(SampleStore, _DistantStore(store, setup.store))
+        self._bench = Workbench(setup, samples, lambda task, count: ray.get(shown[task])[:count])
 
     def run(self, work: SceneWork) -> Iterator[Outcome | WorkError]:
         """Yields each outcome of ``work``, and the error that ended it early, if any."""
@@ -128,11 +130,6 @@ class _Actor:
             yield from self._bench.run(work)
         except Exception as error:
             yield WorkError.of(error)
-
-    def _demonstrations(self, task: str, count: int) -> list[Demonstration]:
-        import ray
-
-        return ray.get(self._shown[task])[:count]
 
 
 class _DistantStore:

@@ -17,7 +17,7 @@ from scipy import stats
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.suites import Suite
-from robust_instant_policy.evaluation.variant import ROW_METHODS, Scene, Variant
+from robust_instant_policy.evaluation.variant import ROW_METHODS, Scene, Variant, labels
 from robust_instant_policy.geometry import FloatArray
 
 MARKS = ((5e-3, "**"), (5e-2, "*"))  # the paper's, below these p-values
@@ -220,6 +220,7 @@ class Summary:
         known = [variant for variant, rows in self._rows.items() if rows]
         # whatever the order in which they were asked for, run by run
         self.variants: list[Variant] = sorted(known, key=lambda variant: ROW_METHODS.index(variant.method))
+        self.labels: dict[Variant, str] = dict(zip(self.variants, labels(self.variants), strict=True))
         self.tasks: list[str] = [task for task in suite.tasks if any(row.scene.task == task for row in self.rows)]
 
     def rows_of(self, variant: Variant, task: str | None = None) -> list[Episode]:
@@ -231,12 +232,14 @@ class Summary:
         rows = self.rows_of(variant, task)
         return Rate(tuple(_means_of_scenes(rows).values()), len(rows)) if rows else None
 
+    def rates(self, variant: Variant, tasks: Iterable[str]) -> list[Rate]:
+        """In those of ``tasks`` in which the variant was tried."""
+        return [rate for task in tasks if (rate := self.rate(variant, task)) is not None]
+
     def of_tasks(self, variant: Variant, beside: Variant | None = None) -> list[float]:
         """The success rate in each task that the variant was tried in, and ``beside``, if given, was tried in, too."""
-        rates = (
-            self.rate(variant, task) for task in self.tasks if beside is None or self.rate(beside, task) is not None
-        )
-        return [rate.value for rate in rates if rate is not None]
+        tasks = (task for task in self.tasks if beside is None or self.rate(beside, task) is not None)
+        return [rate.value for rate in self.rates(variant, tasks)]
 
     def over_tasks(self, variant: Variant) -> tuple[float, float]:
         """Mean and standard deviation of the success rate over tasks."""

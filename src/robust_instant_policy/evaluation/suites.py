@@ -64,14 +64,11 @@ class Suite:
 
     @property
     def scenes(self) -> list[Scene]:
-        return [
-            Scene(task, self._objects(task), seed, self.assets, self.level)
-            for task in self.tasks
-            for seed in self.seeds
-        ]
-
-    def _objects(self, task: str) -> str:
-        return self.objects if self.level == "paper" or task in UNSEEN_TASKS else "seen"
+        found = []
+        for task in self.tasks:
+            objects = self.objects if self.level == "paper" or task in UNSEEN_TASKS else "seen"
+            found += [Scene(task, objects, seed, self.assets, self.level) for seed in self.seeds]
+        return found
 
     @property
     def identity(self) -> tuple[str, str, str, str]:

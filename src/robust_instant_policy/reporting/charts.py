@@ -19,7 +19,8 @@ from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 MM = 1000.0
 AXIS_STEPS = 6  # gripper axes drawn along the robust trajectory
 AXIS_LENGTH_M = 0.03
-AXES = (("#d62728", "gripper x"), ("#2ca02c", "gripper y (opening)"), ("#1f77b4", "gripper z (approach)"))
+AXIS_COLOURS = ("#d62728", "#2ca02c", "#1f77b4")  # of x, y and z
+AXIS_NAMES = ("gripper x", "gripper y (opening)", "gripper z (approach)")
 CAMERA = {"eye": {"x": 1.5, "y": -1.6, "z": 1.2}, "center": {"x": 0, "y": 0, "z": -0.2}}  # shows all of it
 COLUMNS = 3  # of charts side by side
 MAX_POINTS = 8_000  # of the point cloud under the paths
@@ -164,7 +165,7 @@ def _add_robust_path(figure: go.Figure, plan: Plan, arm: int) -> None:
     poses = GripperTriangle.from_triplets(triplets).poses(triplets)
     for step in np.unique(np.linspace(0, len(poses) - 1, AXIS_STEPS).astype(int)):
         origin, rotation = poses[step, :3, 3], poses[step, :3, :3]
-        for axis, (colour, name) in enumerate(AXES):
+        for axis, (colour, name) in enumerate(zip(AXIS_COLOURS, AXIS_NAMES, strict=True)):
             _add_points(
                 figure,
                 np.stack([origin, origin + AXIS_LENGTH_M * rotation[:, axis]]),

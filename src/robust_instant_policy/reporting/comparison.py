@@ -19,11 +19,8 @@ def paper_rate(summary: Summary, variant: Variant, task: str) -> int | None:
     """The paper's success rate in percent for a ``variant`` of ``summary`` with the settings of Table I, or of a method
     (such as dp) that is the same in all configurations and stands beside ones in the paper's; else None.
     """
-    same = not variant.config or (variant.config in PAPER_CONFIGS and _is_of_table1(variant))
+    usual = Variant(variant.method)  # of Table I
+    settings = ("demos", "queries", "dof", "downsampling")
+    is_usual = all(getattr(variant, name) == getattr(usual, name) for name in settings)
+    same = not variant.config or (variant.config in PAPER_CONFIGS and is_usual)
     return table1(variant.method, task) if same and is_comparable(summary) else None
-
-
-def _is_of_table1(variant: Variant) -> bool:
-    """Whether it has the paper's number of demonstrations and samples, ν and downsampling."""
-    usual = Variant(variant.method)
-    return all(getattr(variant, name) == getattr(usual, name) for name in ("demos", "queries", "dof", "downsampling"))

@@ -59,7 +59,10 @@ def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
         recording.send_recording_name(name)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         yield recording
-        _flush(recording, where)
+        try:
+            recording.flush(timeout_sec=FLUSH_S)
+        except (RuntimeError, ValueError) as error:
+            raise RipError(f"what was logged did not arrive at {where}: {excerpt(error)}; is a viewer there?") from None
         recording.disconnect()
         if part is not None:
             part.replace(where)
@@ -92,13 +95,6 @@ def _send_to(recording: rr.RecordingStream, where: str) -> Path | None:
     return None
 
 
-def _flush(recording: rr.RecordingStream, where: str) -> None:
-    try:
-        recording.flush(timeout_sec=FLUSH_S)
-    except (RuntimeError, ValueError) as error:
-        raise RipError(f"what was logged did not arrive at {where}: {excerpt(error)}; is a viewer there?") from None
-
-
 def _require_viewer(address: str) -> None:
     """Raises `RipError` where nothing listens at ``address``: the recording would wait for it."""
     try:
@@ -121,8 +117,7 @@ def log_plan(
     recording.log("world/camera/rgb/keypoints", rr.Points2D(plan.pixels, radii=4, labels=labels, show_labels=False))
     for index, candidate in enumerate(plan.candidates):
         _log_candidate(recording, index, candidate, plan)
-    _log_path(recording, "world/plan", plan.trajectory, PATH_M)
-    _log_steps(recording, "world/plan/gripper", plan.trajectory)
+    _log_trajectory(recording, plan.trajectory)
     if measured is not None:
         strips = list(np.swapaxes(measured, 0, 1))
         labels = ["measured"] * len(strips)
@@ -152,12 +147,11 @@ def log_demonstrations(recording: rr.RecordingStream, demonstrations: Sequence[D
         recording.set_time("demonstration", sequence=index)
         recording.set_time("step", sequence=0)
         _log_observation(recording, demonstration.observation)
-        _log_path(recording, "world/plan", demonstration.trajectory, PATH_M)
         facts = "\n".join(f"- {name}: {value}" for name, value in demonstration.info.items())
         seed = "" if demonstration.seed is None else f", seed {demonstration.seed}"
         text = f"# {demonstration.task} {index}{seed}\n\n{demonstration.seconds:.1f} s\n\n{facts}"
         recording.log("notes", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
-        _log_steps(recording, "world/plan/gripper", demonstration.trajectory)
+        _log_trajectory(recording, demonstration.trajectory)
         for step, image in enumerate(demonstration.frames() if demonstration.frames is not None else ()):
             recording.set_time("step", sequence=step)
             recording.log("world/camera/rgb", rr.Image(image).compress(jpeg_quality=80))
@@ -185,15 +179,14 @@ def _log_candidate(recording: rr.RecordingStream, index: int, candidate: Traject
 
     is_ignored = bool(plan.hallucinated[index])
     name = f"candidate {index + 1}" + (f", hallucinated from step {plan.onset[index]}" if is_ignored else "")
-    tips = candidate.tool_points
-    pieces = np.stack([tips[:-1], tips[1:]], axis=2).reshape(-1, 2, 3)  # (steps · arms, 2, 3)
-    steps = np.linspace(0, 1, max(len(tips) - 1, 1))
+    pieces = _pieces(candidate)
+    steps = np.linspace(0, 1, max(len(candidate) - 1, 1))
     weights = np.interp(steps, plan.trajectory.times, plan.weights[index]).repeat(candidate.num_arms)
     rgb = np.tile(HALLUCINATED if is_ignored else KEPT, (len(pieces), 1))
     colours = np.column_stack([rgb, 40 + 215 * weights]).astype(np.uint8)
     path = f"world/candidates/{index + 1}"
     recording.log(path, rr.LineStrips3D(pieces, colors=colours, radii=CANDIDATE_M))
-    recording.log(f"{path}/name", rr.Points3D(tips[-1, :1], labels=name, radii=CANDIDATE_M))
+    recording.log(f"{path}/name", rr.Points3D(candidate.tool_points[-1, :1], labels=name, radii=CANDIDATE_M))
     recording.log(f"weights/{index + 1}", rr.SeriesLines(names=name, colors=rgb[:1]), static=True)
     for step, weight in enumerate(plan.weights[index]):
         recording.set_time("step", sequence=step)
@@ -201,25 +194,25 @@ def _log_candidate(recording: rr.RecordingStream, index: int, candidate: Traject
     recording.reset_time()
 
 
-def _log_path(recording: rr.RecordingStream, path: str, trajectory: Trajectory, radius: float) -> None:
-    """The way between the fingertips, in one colour where the gripper is open and in another where it is closed."""
+def _pieces(trajectory: Trajectory) -> FloatArray:
+    """Segments ``((T - 1)·A, 2, 3)`` of the way between the fingertips, step by step."""
+    tips = trajectory.tool_points
+    return np.stack([tips[:-1], tips[1:]], axis=2).reshape(-1, 2, 3)
+
+
+def _log_trajectory(recording: rr.RecordingStream, trajectory: Trajectory) -> None:
+    """The way between the fingertips, in one colour where the gripper is open and in another where it is closed, and
+    the gripper at each step: from one fingertip over the gripper point to the other one."""
     import rerun as rr
 
-    tips = trajectory.tool_points
-    pieces = np.stack([tips[:-1], tips[1:]], axis=2).reshape(-1, 2, 3)
+    pieces = _pieces(trajectory)
     closed = trajectory.gripper_state[:-1].ravel() > 0.5
     colours = np.where(closed[:, None], CLOSED, OPEN).astype(np.uint8)
-    recording.log(path, rr.LineStrips3D(pieces, colors=colours, radii=radius))
-
-
-def _log_steps(recording: rr.RecordingStream, path: str, trajectory: Trajectory) -> None:
-    """The gripper at each step: from one fingertip over the gripper point to the other one."""
-    import rerun as rr
-
+    recording.log("world/plan", rr.LineStrips3D(pieces, colors=colours, radii=PATH_M))
     for step, (arms, state) in enumerate(zip(trajectory.triplets, trajectory.gripper_state, strict=True)):
         recording.set_time("step", sequence=step)
-        colours = [CLOSED if closed > 0.5 else OPEN for closed in state]
-        recording.log(path, rr.LineStrips3D(arms[:, [1, 0, 2]], colors=colours, radii=PATH_M))
+        shades = [CLOSED if closed > 0.5 else OPEN for closed in state]
+        recording.log("world/plan/gripper", rr.LineStrips3D(arms[:, [1, 0, 2]], colors=shades, radii=PATH_M))
 
 
 def _blueprint() -> Any:

@@ -19,6 +19,7 @@ from robust_instant_policy.files import open_regular, parse_json, read_regular, 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.policy import Plan, Stage
 from robust_instant_policy.reporting.charts import (
+    AXIS_COLOURS,
     MM,
     ROBUST_COLOUR,
     candidate_colour,
@@ -189,7 +190,7 @@ def _frames_over_scene(observation: Observation, plan: Plan) -> Picture:
     unit = observation.rgb.shape[1] / REFERENCE_WIDTH
     drawn = []
     for frame in plan.frames:
-        for axis, colour in enumerate(("#d62728", "#2ca02c", "#1f77b4")):
+        for axis, colour in enumerate(AXIS_COLOURS):
             ends = frame.pose[:3, 3] + np.stack([np.zeros(3), FRAME_AXIS_M * frame.pose[:3, axis]])
             title = f"steps {frame.first} to {frame.last}: {frame.words}"
             drawn.append(Line(svg_points(ends, observation), colour, 2.2 * unit, "", title))
@@ -258,18 +259,11 @@ def _confidence_table(plan: Plan) -> Table:
 def _execution_table(path: MeasuredPath) -> Table:
     """How far the measured path is from the commanded one, for each arm."""
     rows = []
-    for arm in range(path.tool_errors.shape[1]):
-        errors, joints = path.tool_errors[:, arm], path.joint_errors[:, arm]
-        if len(errors):
-            rows.append(
-                (
-                    str(arm + 1),
-                    f"{len(errors) / path.rate_hz:.1f}",
-                    f"{MM * np.median(errors):.1f}",
-                    f"{MM * errors.max():.1f}",
-                    f"{np.rad2deg(joints.max()):.1f}",
-                )
-            )
+    for arm in range(path.tool_errors.shape[1] if len(path.seconds) else 0):
+        errors, seconds = MM * path.tool_errors[:, arm], len(path.seconds) / path.rate_hz
+        degrees = np.rad2deg(path.joint_errors[:, arm].max())
+        numbers = (seconds, np.median(errors), errors.max(), degrees)
+        rows.append((str(arm + 1), *(f"{number:.1f}" for number in numbers)))
     head = ("arm", "seconds", "tool: median [mm]", "tool: largest [mm]", "joint: largest [degrees]")
     return Table(head, tuple(rows), "")
 
