@@ -17,7 +17,7 @@ import signal
 import threading
 import time
 from collections.abc import Mapping
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
@@ -28,7 +28,7 @@ from robust_instant_policy.datasets.images import encode_image
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import RipError, RobotError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.network import is_loopback
+from robust_instant_policy.network import Answer, is_loopback, serve_loopback
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.reporting.pages import render
 from robust_instant_policy.reporting.pictures import Picture, keypoint_marks, picture
@@ -133,10 +133,7 @@ def _serve(
     except RipError as error:
         wire.send(str(error))
         return
-    server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(page))
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    wire.send((camera.name, f"http://127.0.0.1:{server.server_address[1]}"))
+    wire.send((camera.name, serve_loopback(page.answer)))
     with contextlib.suppress(EOFError, OSError):
         _work(wire, camera, page)
     camera.disconnect()
@@ -204,35 +201,17 @@ class _Page:
         caption = "; ".join((f"{words} {low:.2f} to {high:.2f}", *located.notes))
         return picture(seen.rgb, caption, marks=keypoint_marks(located.pixels, located.confidence))
 
-
-def _handler(page: _Page) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            path, start = self.path.partition("?")[0], page.start
-            if not is_loopback(re.sub(r":\d+$", "", self.headers.get("Host", ""))):
-                self._send(403, "text/plain", b"this address is for this machine only")  # a name that resolves to it
-            elif path == "/":
-                self._send(200, "text/html", render("record.html", title="Recording").encode())
-            elif path == "/live.jpg":
-                self._send(200 if page.live else 404, "image/jpeg", page.live)
-            elif path == "/state":
-                state = {"line": page.line, "error": page.error, "start": page.shown}
-                self._send(200, "application/json", json.dumps(state).encode())
-            elif path == "/start":
-                self._send(200, "text/html", b"" if start is None else render("start.html", start=start).encode())
-            else:
-                self._send(404, "text/plain", b"not here")
-
-        def _send(self, status: int, kind: str, content: bytes) -> None:
-            with contextlib.suppress(OSError):  # the browser went away
-                self.send_response(status)
-                self.send_header("Content-Type", kind)
-                self.send_header("Content-Length", str(len(content)))
-                self.send_header("Cache-Control", "no-store")
-                self.end_headers()
-                self.wfile.write(content)
-
-        def log_message(self, format: str, *arguments: object) -> None:
-            """Write nothing to the terminal: the operator reads it."""
-
-    return Handler
+    def answer(self, request: BaseHTTPRequestHandler) -> Answer:
+        path, start = request.path.partition("?")[0], self.start
+        if not is_loopback(re.sub(r":\d+$", "", request.headers.get("Host", ""))):
+            return 403, "text/plain", b"this address is for this machine only"  # a name that resolves to it
+        if path == "/":
+            return 200, "text/html", render("record.html", title="Recording").encode()
+        if path == "/live.jpg":
+            return 200 if self.live else 404, "image/jpeg", self.live
+        if path == "/state":
+            state = {"line": self.line, "error": self.error, "start": self.shown}
+            return 200, "application/json", json.dumps(state).encode()
+        if path == "/start":
+            return 200, "text/html", b"" if start is None else render("start.html", start=start).encode()
+        return 404, "text/plain", b"not here"

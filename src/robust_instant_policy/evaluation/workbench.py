@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, cast
 
@@ -17,7 +18,6 @@ from robust_instant_policy.errors import ModelError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import FailureAnalysis, Truth, film, true_keypoints
 from robust_instant_policy.evaluation.rollout import ScenePolicy, roll_out
-from robust_instant_policy.evaluation.scene_policies import RefusingPolicy, ReplayedDemonstrator
 from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.variant import REPLAY, Scene, Variant
 from robust_instant_policy.evaluation.work import Analysis, Outcome, Planned, SceneWork, Setup
@@ -43,7 +43,7 @@ from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Task, offers, require
-from robust_instant_policy.trajectory import Trajectory
+from robust_instant_policy.trajectory import Trajectory, downsample
 
 if TYPE_CHECKING:  # it needs the extra "train"
     from robust_instant_policy.policies.diffusion.training import TrainedPolicy
@@ -167,13 +167,13 @@ class Workbench:
         plan, self._samples[asked] = policy.plan_from(self._located[key], self._samples.get(asked, NO_SAMPLES))
         return plan
 
-    def _demonstrate(self) -> Trajectory:
-        """What the demonstrator does in the current scene, which is built anew afterwards."""
+    def _demonstrate(self, downsampling: str) -> Plan:
+        """What the demonstrator does in the current scene, thinned out; the scene is built anew afterwards."""
         assert self._task is not None
         require(self._task, "demonstrate")
         shown = self._task.demonstrate(self._seed).demonstration.trajectory
         self._task.reset(self._seed)
-        return shown
+        return Plan.of(downsample(shown, downsampling))
 
     def _settings(self, variant: Variant) -> Settings:
         assert self._task is not None
@@ -192,7 +192,7 @@ class Workbench:
                 training = Training(self._setup.checkpoints, variant.steps, report=self._report)
             model = cast(LanguageModel, _Later(self))
             if variant.method == REPLAY:
-                self._policies[variant] = ReplayedDemonstrator(self._demonstrate, variant.downsampling)
+                self._policies[variant] = StandIn(partial(self._demonstrate, variant.downsampling))
                 return self._policies[variant]
             policy = make_policy(variant.method, model, self._settings(variant), training, self._setup.deadline_s)
             if isinstance(policy, KeypointPolicy):
@@ -204,7 +204,7 @@ class Workbench:
                         else RememberingPolicy(self, policy, variant.demos)
                     )
                 except UNPLANNABLE as error:
-                    self._policies[variant] = RefusingPolicy(error)
+                    self._policies[variant] = StandIn(partial(_refuse, error))
             else:  # in closed loop; what it has after `fit` only makes it no `ClosedLoopPolicy` for isinstance yet
                 shown = self._read_demonstrations(self._place[0], variant.demos, with_images=True)
                 self._policies[variant] = cast(ClosedLoopPolicy, policy).fit(shown)
@@ -276,6 +276,27 @@ class RememberingPolicy:
 
     def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
         return self.policy.executions(plan)
+
+
+@dataclass(frozen=True)
+class StandIn:
+    """In place of a fitted policy: ``make`` returns the plan for the current scene, or raises why there is none."""
+
+    make: Callable[[], Plan]
+
+    def plan(self, observation: Observation) -> Plan:
+        return self.make()
+
+    def plan_scene(self, scene: LocatedScene) -> Plan:
+        return self.make()
+
+    def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
+        return (plan.trajectory,)
+
+
+def _refuse(error: Exception) -> Plan:
+    """The plan of a policy that cannot be fitted to the demonstrations."""
+    raise error
 
 
 class _Later:

@@ -82,7 +82,7 @@ class Session:
         self._steps: deque[tuple[FloatArray, FloatArray, np.ndarray]] = deque()  # command, poses, closed
         self._targets = np.zeros((0, 4, 4))
         self._closed = np.zeros(0, dtype=bool)
-        self._follower: Follower | None = None
+        self._follower: Follower  # of a cell with arms, from the first scene on
         self._on_played: Callable[[str | None], None] | None = None
 
     def post(self, job: Job) -> None:
@@ -159,7 +159,7 @@ class Session:
 
     def release(self) -> None:
         """End of a drag: targets that could not be followed go back to the grippers."""
-        if self._follower is not None and self.status.refusal:
+        if self.status.refusal:
             self._targets = self._follower.motion.poses[-1].copy()
             self._set(refusal="")
 
@@ -179,7 +179,6 @@ class Session:
             self._take = take
             for command in take.commands:
                 self.cell.advance(command)
-            assert self._follower is not None
             joints = take.commands[-1].reshape(len(self.cell.arms), -1)
             end = take.poses[-1][None], take.closed[-1][None]
             self._follower.resume(Motion(joints[None, :, :-1], joints[None, :, -1], *end))
@@ -230,7 +229,6 @@ class Session:
             self.discard()
         self._queue(motion)
         self._on_played = on_played
-        assert self._follower is not None
         self._follower.resume(motion)
         self._set(phase="playing")
 
@@ -254,7 +252,6 @@ class Session:
         """Stop the motion that is being played where the arms are; returns whether there was one."""
         if self.status.phase != "playing":
             return False
-        assert self._follower is not None
         motion = self._follower.motion
         done = max(len(motion.poses) - len(self._steps), 1)
         self._follower.resume(
@@ -303,12 +300,12 @@ class Session:
         self.status = Status("ready", closed=tuple(self._closed), failure=cell.failure())
 
     def _is_operated(self) -> bool:
-        return self.status.phase in ("ready", "recording", "done") and self._follower is not None
+        has_arms = self.cell is not None and len(self.cell.arms) > 0
+        return has_arms and self.status.phase in ("ready", "recording", "done")
 
     def _tick(self) -> None:
         """One control step."""
         assert self.cell is not None
-        assert self._follower is not None
         phase = self.status.phase
         if self.status.is_full:
             return  # the cell waits for the recording to be kept, cut or discarded
@@ -342,7 +339,6 @@ class Session:
 
     def _played(self) -> None:
         assert self.cell is not None
-        assert self._follower is not None
         self._steps.clear()
         self._targets = self._follower.motion.poses[-1].copy()
         self._closed = self._follower.motion.closed[-1].copy()
