@@ -17,7 +17,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from robust_instant_policy.checks import checked_array, checked_pose
+from robust_instant_policy.checks import checked_array, checked_pose, checked_positive
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.files import open_regular, write_whole
 from robust_instant_policy.geometry import FloatArray, as_numbers, lift
@@ -179,9 +179,7 @@ class Demonstration:
     frames: Callable[[], Iterator[NDArray[np.uint8]]] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        rate = self.rate_hz
-        if isinstance(rate, bool) or not isinstance(rate, int | float | np.number) or not 0 < rate < np.inf:
-            raise InvalidValueError(f"rate_hz must be a positive number of Hz, got {rate!r}")
+        checked_positive("rate_hz", self.rate_hz)
 
     @property
     def seconds(self) -> float:

@@ -5,7 +5,7 @@ leaders ─read─▶ soft start ─▶ wanted ─▶ `Station.lead` (gate, foll
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -30,6 +30,7 @@ STILL_KEPT_S = 0.1  # of rest that stays before the first and after the last mot
 MIN_STEPS = 10  # of a demonstration
 
 DISCARD, QUIT = "d", "q"
+OnStep = Callable[[Sequence[Command], Sequence[float], Sequence[ArmState]], None]
 
 
 class Following:
@@ -37,11 +38,20 @@ class Following:
     None holds.
 
     ``key`` is the key that ended it, "" where a stop was requested. Grippers open and close completely, as they will
-    when a plan is executed.
+    when a plan is executed. ``on_step`` is called in each step while leaders and followers are coupled: with the last
+    commands, the travel of each gripper, open or closed, and the states after them.
     """
 
-    def __init__(self, station: Station, leaders: Sequence[Leader | None], operator: Operator, coupled: str):
+    def __init__(
+        self,
+        station: Station,
+        leaders: Sequence[Leader | None],
+        operator: Operator,
+        coupled: str,
+        on_step: OnStep = lambda *_: None,
+    ):
         self._station, self._leaders, self._operator, self._words = station, leaders, operator, coupled
+        self._on_step = on_step
         self._travels: list[float] = []  # of each gripper, open or closed, from the first step on
         self._coupled, self._waited, self._gap = False, 0, np.inf
         self.key = ""
@@ -63,15 +73,12 @@ class Following:
                 most if told.finger_travel > most / 2 else 0.0 for told, most in zip(last, full, strict=True)
             ]
         if self._coupled:
-            self._on_step(last, states)
+            self._on_step(last, self._travels, states)
         wanted = [
             told if leader is None else self._whole(arm, leader.read(state))
             for arm, (leader, state, told) in enumerate(zip(self._leaders, states, last, strict=True))
         ]
         return wanted if self._coupled else self._approach(last, wanted)
-
-    def _on_step(self, last: Sequence[Command], states: Sequence[ArmState]) -> None:
-        """Called with the last commands and the states after them, while leaders and followers are coupled."""
 
     def _whole(self, arm: int, told: Command) -> Command:
         """``told`` with the gripper open or closed."""
@@ -98,30 +105,6 @@ class Following:
         return [Command(told.joints + np.clip(gap, -most, most), told.finger_travel) for told, gap in pairs]
 
 
-class _Teaching(Following):
-    """`Following` that keeps ``steps`` and ``seconds``, those of `Episode`."""
-
-    def __init__(self, station: Station, leaders: Sequence[Leader | None], operator: Operator, journal: Journal):
-        super().__init__(station, leaders, operator, "coupled, recording: Enter ends the demonstration, d discards it")
-        self._journal, self._logging = journal, True
-        self.steps: list[FloatArray] = []
-        self.seconds: list[float] = []
-
-    def _on_step(self, last: Sequence[Command], states: Sequence[ArmState]) -> None:
-        pairs = zip(last, self._travels, states, strict=True)
-        step = np.array(
-            [[[*told.joints, travel], [*state.joints, state.finger_travel]] for told, travel, state in pairs]
-        )
-        self.steps.append(step)
-        self.seconds.append(self._station.sent_at)
-        if self._logging:
-            try:
-                self._journal.add(self.seconds[-1], step)
-            except OSError as error:  # the arms move: the disk can wait
-                self._logging = False
-                self._operator.say(f"the journal cannot be written ({error.strerror}); recording goes on in memory")
-
-
 def teach(
     station: Station, leaders: Sequence[Leader], start: Observation, journal: Journal, operator: Operator
 ) -> tuple[Episode, str]:
@@ -129,15 +112,31 @@ def teach(
 
     Raises `RobotError` where a device fails; the journal then holds the episode.
     """
-    digest = station.config.digest
-    journal.begin(start, digest, (len(station.arms), 2, len(station.arms[0].home) + 1))
-    teaching = _Teaching(station, leaders, operator, journal)
+    digest, shape = station.config.digest, (len(station.arms), 2, len(station.arms[0].home) + 1)
+    steps: list[FloatArray] = []
+    seconds: list[float] = []
+    in_memory = False
+
+    def keep(last: Sequence[Command], travels: Sequence[float], states: Sequence[ArmState]) -> None:
+        nonlocal in_memory
+        triples = zip(last, travels, states, strict=True)
+        steps.append(np.array([[[*a.joints, travel], [*b.joints, b.finger_travel]] for a, travel, b in triples]))
+        seconds.append(station.sent_at)
+        if not in_memory:
+            try:
+                journal.add(seconds[-1], steps[-1])
+            except OSError as error:  # the arms move: the disk can wait
+                in_memory = True
+                operator.say(f"the journal cannot be written ({error.strerror}); recording goes on in memory")
+
+    journal.begin(start, digest, shape)
+    words = "coupled, recording: Enter ends the demonstration, d discards it"
+    following = Following(station, leaders, operator, words, keep)
     try:
-        station.lead(teaching)
+        station.lead(following)
     finally:
         journal.end()
-    steps = np.array(teaching.steps).reshape(-1, len(station.arms), 2, len(station.arms[0].home) + 1)
-    return Episode(start, steps, np.array(teaching.seconds), digest), teaching.key
+    return Episode(start, np.array(steps).reshape(-1, *shape), np.array(seconds), digest), following.key
 
 
 def guide(station: Station, leaders: Sequence[Leader | None], operator: Operator, words: str) -> str:

@@ -58,12 +58,16 @@ def _looks_up(surface: Surface) -> np.ndarray:
 
 
 def _mesh(surface: Surface, faces: np.ndarray, name: str) -> trimesh.Trimesh:
+    image = None
+    if surface.texture is not None:
+        image = Image.fromarray(np.ascontiguousarray(surface.texture))
+        image.thumbnail((MAX_TEXTURE_PIXELS, MAX_TEXTURE_PIXELS))
     material = trimesh.visual.material.PBRMaterial(
         name=name,
         baseColorFactor=np.clip(surface.colour * 255, 0, 255).astype(np.uint8),
         metallicFactor=0.0,
         roughnessFactor=ROUGHNESS,
-        baseColorTexture=None if surface.texture is None else _image(surface.texture),
+        baseColorTexture=image,
     )
     visual = trimesh.visual.TextureVisuals(uv=surface.uvs, material=material)
     return trimesh.Trimesh(surface.vertices, faces, visual=visual, process=False)
@@ -74,12 +78,6 @@ def _mark_unlit(tree: dict[str, Any]) -> None:
         if material["name"] == UNLIT:
             material["extensions"] = {UNLIT: {}}
             tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), UNLIT})
-
-
-def _image(texture: np.ndarray) -> Image.Image:
-    image = Image.fromarray(np.ascontiguousarray(texture))
-    image.thumbnail((MAX_TEXTURE_PIXELS, MAX_TEXTURE_PIXELS))
-    return image
 
 
 def polyline(points: FloatArray) -> FloatArray:

@@ -59,7 +59,8 @@ class Stage:
         """Move the bodies to ``poses``."""
         with self._server.atomic():
             for name, pose in poses.items():
-                if name in self._bodies and not self._is_shown(name, pose):
+                before = self._shown.get(name)
+                if name in self._bodies and (before is None or np.abs(pose - before).max() >= MOVED):
                     place(self._bodies[name][1], pose)
                     self._shown[name] = pose
 
@@ -104,9 +105,6 @@ class Stage:
         handle = self.scene.add_glb(f"/cell/{name.replace('/', '.') or 'world'}", drawing.glb(surfaces))
         self._bodies[name] = look, handle
         self._shown.pop(name, None)
-
-    def _is_shown(self, name: str, pose: FloatArray) -> bool:
-        return name in self._shown and bool(np.abs(pose - self._shown[name]).max() < MOVED)
 
 
 def place(handle: Any, pose: FloatArray) -> None:
