@@ -7,6 +7,7 @@ import errno
 import fcntl
 import grp
 import hashlib
+import io
 import json
 import os
 import pwd
@@ -14,9 +15,13 @@ import secrets
 import shutil
 import stat
 import sys
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robust_instant_policy.errors import DatasetError
 
@@ -91,6 +96,27 @@ def _whole(digits: str) -> int:
     if len(digits.lstrip("-")) > sys.float_info.max_10_exp:
         raise ValueError(f"an integer of {len(digits)} digits")
     return int(digits)
+
+
+def save_arrays(path: Path, arrays: Mapping[str, object]) -> None:
+    """Write a compressed ``.npz`` file."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    write_whole(path, buffer.getvalue())
+
+
+def load_arrays(path: Path, names: Collection[str], advice: str) -> dict[str, NDArray]:
+    """The arrays of an ``.npz`` file, ``names`` among them. Raises `DatasetError` that ends with the ``advice``."""
+    try:
+        with open_regular(path) as file, np.load(file, allow_pickle=False) as archive:
+            arrays = dict(archive)
+        if lacking := [name for name in names if name not in arrays]:
+            raise ValueError(f"it lacks {', '.join(lacking)}")
+        return arrays
+    except FileNotFoundError:
+        raise DatasetError(f"{path} is missing; {advice}") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise DatasetError(f"{path} is damaged ({error}); {advice}") from None
 
 
 def sha256(path: Path) -> str:

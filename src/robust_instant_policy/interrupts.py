@@ -35,6 +35,16 @@ def noted_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@contextmanager
+def blocked(*numbers: signal.Signals) -> Iterator[None]:
+    """Signals of ``numbers`` wait until the end of the context; processes that start within it inherit that."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def raise_pending() -> None:
     """Raise `KeyboardInterrupt` if there was a Ctrl-C that nobody caught."""
     if _pending.is_set():

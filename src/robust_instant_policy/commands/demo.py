@@ -19,14 +19,7 @@ from robust_instant_policy.evaluation import Variant, holds_results, obtain_demo
 from robust_instant_policy.files import file_stem
 from robust_instant_policy.llm import check_server, model_name
 from robust_instant_policy.policies import Plan
-from robust_instant_policy.reporting.run import (
-    PLAN_FILE,
-    SEEN_FILE,
-    VIDEO_FILE,
-    RunRecord,
-    save_context,
-    write_report,
-)
+from robust_instant_policy.reporting.run import PLAN_FILE, SEEN_FILE, VIDEO_FILE, RunRecord, save_context, write_report
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.task import Task
 

@@ -28,6 +28,7 @@ from robust_instant_policy.datasets.images import encode_image
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import RipError, RobotError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.interrupts import blocked
 from robust_instant_policy.network import Answer, is_loopback, serve_loopback
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.reporting.pages import render
@@ -66,11 +67,8 @@ class LiveCamera:
     def connect(self) -> None:
         self._sender.start()
         # Ctrl-C is the recording process's, also while the other one starts, which inherits what is blocked.
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-        try:
+        with blocked(*SIGNALS):
             self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         self._theirs.close()  # so that the end of the process ends the pipe
         self.name, self.url = self._answer(STARTING_S)
 

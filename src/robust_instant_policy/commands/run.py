@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -81,7 +81,11 @@ def run(options: argparse.Namespace) -> int:
     make_folder(out)
     with ExitStack() as stack:
         config, emulation = stack.enter_context(devices_of(config))
-        planner = None if options.plan else stack.enter_context(_Planner.open(config, options, screen))
+        planner = None
+        if options.plan is None:
+            shown = load_demonstrations(options.demos)
+            policy = stack.enter_context(fitted_policy(options, shown, screen, config.limits.workspace))
+            planner = _Planner(config, screen, shown, policy, model_name(options.llm))
         _Run(config, emulation, planner, out, options, screen).run()
         for number in count(2):
             if options.plan or options.dry_run or options.yes or not _goes_on():
@@ -102,13 +106,6 @@ class _Planner:
     demonstrations: Sequence[Demonstration]
     policy: KeypointPolicy
     llm: str
-
-    @classmethod
-    @contextmanager
-    def open(cls, config: CellConfig, options: argparse.Namespace, screen: StageConsole) -> Iterator[_Planner]:
-        demonstrations = load_demonstrations(options.demos)
-        with fitted_policy(options, demonstrations, screen, config.limits.workspace) as policy:
-            yield cls(config, screen, demonstrations, policy, model_name(options.llm))
 
     def plan(self, seen: Observation, out: Path) -> RunRecord:
         """Plan for what is ``seen``; image, plan and context lie in the run folder ``out`` then."""

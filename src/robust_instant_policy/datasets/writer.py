@@ -30,14 +30,7 @@ from robust_instant_policy.datasets.tables import (
 from robust_instant_policy.datasets.video import encode_video
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import (
-    PART_SUFFIX,
-    excerpt,
-    finished_files,
-    lock_folder,
-    make_folder,
-    write_whole,
-)
+from robust_instant_policy.files import PART_SUFFIX, excerpt, finished_files, lock_folder, make_folder, write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 

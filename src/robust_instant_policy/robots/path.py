@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import open_regular, write_whole
+from robust_instant_policy.files import load_arrays, save_arrays
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.capsules import ArmShape
@@ -23,6 +20,7 @@ CLOSED_M = 1e-6
 
 SWEPT_MOMENTS = 24  # of a motion, at which its arms are drawn
 
+ADVICE = "execute the plan again"
 ARRAYS = ("rate_hz", "commanded", "measured", "commanded_tools", "measured_tools", "loads", "seconds")
 
 
@@ -44,33 +42,18 @@ class Sweep:
         return cls(tool_points(motion.joints, arms), np.concatenate(links, axis=1), rows / rate_hz)
 
     def save(self, path: Path) -> None:
-        _save(path, {"tools": self.tools, "links": self.links, "seconds": self.seconds})
+        save_arrays(path, vars(self))
 
     @classmethod
     def load(cls, path: Path) -> Sweep:
         """Raises `DatasetError` for a file that is not the sweep of a motion."""
-        return cls(**_load(path, ("tools", "links", "seconds")))
+        return cls(**load_arrays(path, ("tools", "links", "seconds"), ADVICE))
 
 
 def tool_points(joints: FloatArray, arms: Sequence[Arm]) -> FloatArray:
     """Points between the fingertips ``(N, A, 3)``, metres in the world, at ``joints (N, A, J)``."""
     points = [[arm.kinematics.tool_pose(row[i])[:3, 3] for i, arm in enumerate(arms)] for row in joints]
     return np.array(points).reshape(len(joints), len(arms), 3)
-
-
-def _save(path: Path, arrays: Mapping[str, object]) -> None:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    write_whole(path, buffer.getvalue())
-
-
-def _load(path: Path, names: Sequence[str]) -> dict[str, FloatArray]:
-    """The arrays of a file that `_save` wrote. Raises `DatasetError` for another one."""
-    try:
-        with open_regular(path) as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in names}
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise DatasetError(f"{path} cannot be read: {error}; execute the plan again") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +71,12 @@ class MeasuredPath:
     seconds: FloatArray
 
     def save(self, path: Path) -> None:
-        _save(path, {name: getattr(self, name) for name in ARRAYS})
+        save_arrays(path, vars(self))
 
     @classmethod
     def load(cls, path: Path) -> MeasuredPath:
         """Raises `DatasetError` for a file that is not a measured path."""
-        arrays = _load(path, ARRAYS)
+        arrays = load_arrays(path, ARRAYS, ADVICE)
         return cls(float(arrays.pop("rate_hz")), **arrays)
 
     @property

@@ -8,6 +8,7 @@ from typing import Any
 
 import viser
 
+Action = Callable[[Any], None]
 Callback = Callable[[Any], Awaitable[None]]
 NOTE_S = 4.0
 
@@ -24,7 +25,7 @@ class Controls:
         server.on_client_connect(self._come)
         server.on_client_disconnect(self._leave)
 
-    def held(self, action: Callable[[Any], None]) -> Callback:
+    def held(self, action: Action) -> Callback:
         """A callback that calls ``action(event)`` for the holder's events only."""
 
         async def callback(event: Any) -> None:
@@ -41,7 +42,13 @@ class Controls:
 
         return callback
 
-    def input(self, handle: Any, action: Callable[[Any], None]) -> None:
+    def button(self, gui: viser.GuiApi, label: str, action: Action, **look: Any) -> viser.GuiButtonHandle:
+        """A button that calls ``action(event)`` when the holder presses it."""
+        handle = gui.add_button(label, **look)
+        handle.on_click(self.held(action))
+        return handle
+
+    def input(self, handle: Any, action: Action) -> None:
         """Call ``action(event)`` when the holder changes the input ``handle``; what an onlooker changes is undone."""
         accepted = handle.value
 

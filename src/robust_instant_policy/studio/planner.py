@@ -7,6 +7,7 @@ import threading
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -136,22 +137,15 @@ class Planner:
     ) -> None:
         """Plan for ``observation`` with Q ``queries``; an earlier plan is cancelled."""
         self._job += 1
-        work = self._job, tuple(demonstrations), observation, settings, queries
-        threading.Thread(target=self._work, args=work, name="planner", daemon=True).start()
+        plan = partial(self._plan, tuple(demonstrations), observation, settings, queries)
+        threading.Thread(target=self._work, args=(self._job, plan), name="planner", daemon=True).start()
 
     def cancel(self) -> None:
         """End planning; the result of a stage that is under way is dropped."""
         self._job += 1
         self._on_end("")
 
-    def _work(
-        self,
-        job: int,
-        demonstrations: tuple[Demonstration, ...],
-        observation: Observation,
-        settings: Settings,
-        queries: int,
-    ) -> None:
+    def _work(self, job: int, plan: Callable[[Callable[..., None]], None]) -> None:
         def stage(name: str, share: float | None = None) -> None:
             if job != self._job:
                 raise Cancelled
@@ -160,7 +154,7 @@ class Planner:
         try:
             stage("waiting for the plan before")
             with self._lock:
-                self._plan(stage, demonstrations, observation, settings, queries)
+                plan(stage)
             stage("done", 1.0)
             self._on_end("")
         except Cancelled:
@@ -176,11 +170,11 @@ class Planner:
 
     def _plan(
         self,
-        stage: Callable[..., None],
         demonstrations: tuple[Demonstration, ...],
         observation: Observation,
         settings: Settings,
         queries: int,
+        stage: Callable[..., None],
     ) -> None:
         if not demonstrations:
             raise UsageError("nothing was demonstrated yet: show the task first")
