@@ -1,4 +1,4 @@
-"""What the camera saw and what the person did."""
+"""An RGB-D observation, and a demonstration."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def install_command(extra: str) -> str:
 
 
 class MissingMethodError(UsageError):
-    """A task of one's own that lacks an optional method."""
+    """A user's task that lacks an optional method."""
 
     def __init__(self, task: str, method: str, purpose: str):
         super().__init__(f"the task {task} has no {method}(), which is needed {purpose} (docs/own-tasks.md)")

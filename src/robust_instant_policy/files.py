@@ -85,7 +85,7 @@ def read_json(path: str | Path, kind: str = "a JSON object") -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What ``text`` from outside holds. Raises `ValueError`, also for deep nesting and for integers beyond a float."""
+    """Parse JSON from outside. Raises `ValueError`, also for deep nesting and for integers beyond a float."""
     try:
         return json.loads(text, parse_int=_whole)
     except RecursionError:
@@ -127,8 +127,8 @@ def sha256(path: Path) -> str:
 def others_can_write(path: Path, in_own_group: bool = True) -> bool:
     """Whether another user could exchange a file, or one in a folder, between its check and its use.
 
-    Many systems make files writable for a group of which their owner is the only member; without ``in_own_group`` that
-    counts as nobody.
+    Many systems make files writable for a group of which their owner is the only member; without ``in_own_group`` such
+    a group is ignored.
     """
     status = path.stat()
     if status.st_uid not in (0, os.geteuid()) or status.st_mode & stat.S_IWOTH:
@@ -157,7 +157,7 @@ def _require_regular(path: str | Path, mode: int) -> None:
 
 
 def excerpt(said: str | Path | Exception) -> str:
-    """What a file or an error says, on one line of at most `MAX_EXCERPT` characters."""
+    """Text of a file or an error on one line of at most `MAX_EXCERPT` characters."""
     text = " ".join(str(said).split())
     return text if len(text) <= MAX_EXCERPT else text[:MAX_EXCERPT] + "…"
 
@@ -238,7 +238,7 @@ def finished_files(path: Path) -> Iterator[Path]:
 
 
 def write_error(path: Path, error: OSError) -> DatasetError:
-    """What to tell the user when ``path`` could not be written."""
+    """The error for a file ``path`` that could not be written."""
     if error.errno in NO_SPACE:
         return DatasetError(
             f"no space left to write {path}; episodes recorded so far are safe: free some space and run the same again"

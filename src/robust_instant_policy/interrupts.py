@@ -1,4 +1,4 @@
-"""Ctrl-C that is not lost.
+"""Handling of Ctrl-C so that none is lost.
 
 Python prints and drops a `KeyboardInterrupt` that is raised inside a destructor, a callback of a weak reference
 (imports have many) or a callback of a C library. So each Ctrl-C is noted, too, and raised again by `raise_pending`.
@@ -46,6 +46,6 @@ def blocked(*numbers: signal.Signals) -> Iterator[None]:
 
 
 def raise_pending() -> None:
-    """Raise `KeyboardInterrupt` if there was a Ctrl-C that nobody caught."""
+    """Raise `KeyboardInterrupt` if a Ctrl-C was noted but dropped."""
     if _pending.is_set():
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Where a server listens, and who can reach it."""
+"""Sockets to listen on, loopback addresses, and a small HTTP server."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
     camera: Camera = CameraNoise().photograph if options.noise else lambda seen, _: seen
     images = [camera(one.observation, NOISE_SEED + index) for index, one in enumerate(demonstrations)]
     name = options.task or demonstrations[0].task
-    # A class of one's own is loaded where the user names it, never where a dataset does.
+    # A class is loaded only if the user names it; a dataset must not make this package run code.
     simulated = (options.task or is_installed(name)) and all(one.seed is not None for one in demonstrations)
     scenes: list[Observation] = []
     accuracy = None

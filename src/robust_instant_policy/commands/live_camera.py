@@ -3,7 +3,7 @@
 recording process ── read, start image, lines ──▶ camera process ──▶ browser, http://127.0.0.1:…
                   ◀──── frames, errors ─────────  camera, keypoints
 
-So neither pictures nor keypoints take time of the process that commands the arms.
+Pictures and keypoints take no time of the process that commands the arms.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class LiveCamera:
         self.name, self.url = config.kind, ""
         context = multiprocessing.get_context("spawn")
         self._wire, self._theirs = context.Pipe()
-        self._outbox: SimpleQueue[tuple[str, object] | None] = SimpleQueue()  # nobody waits for the process to take it
+        self._outbox: SimpleQueue[tuple[str, object] | None] = SimpleQueue()  # `put` does not wait for the process
         self._sender = threading.Thread(target=self._send, daemon=True)
         device = (config.kind, dict(config.options), config.where)
         self._process = context.Process(
@@ -66,7 +66,7 @@ class LiveCamera:
 
     def connect(self) -> None:
         self._sender.start()
-        # Ctrl-C is the recording process's, also while the other one starts, which inherits what is blocked.
+        # Only the recording process handles Ctrl-C; the new process inherits the blocked signals.
         with blocked(*SIGNALS):
             self._process.start()
         self._theirs.close()  # so that the end of the process ends the pipe
@@ -158,7 +158,7 @@ def _work(wire: Connection, camera: VideoCamera, page: _Page) -> None:
         try:
             page.live = encode_image(camera.preview(), "jpeg", quality=JPEG_QUALITY)
             page.error = ""
-        except Exception as error:  # of whatever library: the camera may be read all the same
+        except Exception as error:  # any error of a camera's library; `read` may still work
             page.error = str(error)
         now = time.monotonic()
         due = now + max(LIVE_S, (now - began) / MOST_SHARE)

@@ -1,4 +1,4 @@
-"""`rip new-task`: write the template of a task of one's own, or check one."""
+"""`rip new-task`: write the template of a user's task, or check a task."""
 
 from __future__ import annotations
 

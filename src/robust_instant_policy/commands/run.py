@@ -162,7 +162,7 @@ class _Run:
                 success = _agrees("did it succeed?")
                 self._report(record, success, ["success" if success else "failed: judged so", *grasps])
             played.require_end()
-        if success:  # not where nobody judged it
+        if success:  # None: not judged
             write_whole(self._done, b"")
 
     def _park(self, station: Station) -> None:

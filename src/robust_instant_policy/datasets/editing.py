@@ -1,7 +1,7 @@
 """Deleting, splitting, merging and restoring demonstrations. Folders are copied, images and videos bit by bit.
 
-`lerobot-edit-dataset` drops the start-of-episode images, cameras and facts that only this package knows; `restore`
-takes them from the folder that was edited.
+`lerobot-edit-dataset` drops this package's additions (start-of-episode images, cameras, facts); `restore` takes them
+from the original folder.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def _write(
 
     The folders appear when all of them are complete, or not at all.
     """
-    outs = [Path(out).resolve() for _, out in parts]  # what is called "absent/../there" now would exist later
+    outs = [Path(out).resolve() for _, out in parts]  # resolved now: "absent/../there" would be another path later
     if any(one == other or one in other.parents for one, other in permutations(outs, 2)):
         raise DatasetError("the new folders must be different ones, none of them inside another")
     for root in {one.folder.root for episodes, _ in parts for one in episodes}:

@@ -1,7 +1,7 @@
 """The tables of any LeRobotDataset v3.0 folder; every problem is an error in one line.
 
-A folder may come from anywhere, so its content is checked once, when it is read: types and ranges in
-``meta/info.json`` and ``meta/episodes``, and that all their paths stay inside the folder.
+A folder may come from an unknown source, so its content is checked when it is read: types and ranges in
+``meta/info.json`` and ``meta/episodes``, and that all paths stay inside the folder.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Folder:
             raise damaged(path, f"episode {episode} has {found} {row['length']} images")
 
     def own_file(self, pattern: str, episode: int) -> Path:
-        """Path of an episode's file that only this package writes, or writes one an episode."""
+        """Path of an episode's own file, see `layout`. Raises `DatasetError` if it is outside of the folder."""
         return inside(self.root, layout.episode_path(pattern, episode))
 
     def _path(self, template: str, **fields: object) -> Path:

@@ -134,7 +134,7 @@ def decode_video(
                     raise DatasetError(f"{path} holds images of several sizes: {REPAIR}")
                 if frame.time >= start_s - half_frame:
                     yield frame.to_ndarray(format=pixel_format)
-    # Of what a damaged file lacks, PyAV gives None, or an attribute that is not there.
+    # For data that a damaged file lacks, PyAV returns None or has no such attribute.
     except (
         OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError, MemoryError,
         RuntimeError, av.FFmpegError,

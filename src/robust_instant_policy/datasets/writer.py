@@ -140,9 +140,9 @@ class DatasetWriter:
             self._discarded_seeds = own.get("discarded_seeds", [])
             self._take_up()
             return
-        stranger = next(finished_files(self.path), None)
-        if stranger is not None:
-            raise DatasetError(f"{self.path} holds other files ({stranger.name}); choose an empty or a new folder")
+        other = next(finished_files(self.path), None)
+        if other is not None:
+            raise DatasetError(f"{self.path} holds other files ({other.name}); choose an empty or a new folder")
         self._take_up()
         self._write_own([])
 

@@ -112,7 +112,7 @@ class _Actors:
                 yield worker, message
 
     def close(self) -> None:
-        """Does nothing: Ray ends the actors when the driver disconnects."""
+        """Ray ends the actors when the driver disconnects."""
 
 
 class _Actor:

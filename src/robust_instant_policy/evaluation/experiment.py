@@ -1,4 +1,4 @@
-"""Run suites of variants in scenes with a pool of workers; each row is stored at once, so a run can be resumed."""
+"""Run suites of variants in scenes with a pool of workers; rows are stored one by one, so a run can be resumed."""
 
 from __future__ import annotations
 

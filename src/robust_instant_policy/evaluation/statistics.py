@@ -38,8 +38,8 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 def scene_interval(mean: float, scenes: int) -> tuple[float, float]:
     """95% confidence interval of the ``mean`` of the success rates in so many ``scenes``; (0, 1) without scenes.
 
-    Wilson's interval (Wilson 1927) with one trial a scene. A scene's rate, of whatever number of executions, varies at
-    most as much as a single execution with that probability, so the interval is not too narrow.
+    Wilson's interval (Wilson 1927) with one trial a scene. The rate of a scene with several executions varies at most
+    as much as a single execution with that probability, so the interval is not too narrow.
     """
     if scenes == 0:
         return 0.0, 1.0
@@ -67,9 +67,8 @@ def mean_and_deviation(rates: Sequence[float]) -> tuple[float, float]:
 def t_test(ours: Sequence[float], theirs: Sequence[float]) -> float:
     """Two-sided p of Student's t-test between two methods' success rates over the same tasks; NaN for fewer than two.
 
-    It is computed from mean and standard deviation as `mean_and_deviation` gives them: with these the paper's marks
-    come out of the paper's own Table I, all four. It compares tasks, not executions, and takes no notice of which
-    scenes the methods share: see `paired_test`.
+    Computed from `mean_and_deviation`: this reproduces all four significance marks of the paper from its own Table I.
+    The unit is the task; shared scenes are not used (see `paired_test`).
     """
     if min(len(ours), len(theirs)) < 2:
         return math.nan
@@ -99,9 +98,9 @@ class Paired:
 def paired_test(ours: Mapping[Scene, Fraction], theirs: Mapping[Scene, Fraction]) -> Paired:
     """Exact sign-flip test of the success rates in the scenes that two methods share.
 
-    Were the methods alike, every scene's difference might as well have the other sign: p is the share of all choices of
-    signs with a total at least as far from 0. With one execution a scene this is McNemar's exact test. The scene is the
-    unit, however many executions its rate is of.
+    If the methods are equal, each scene's difference has either sign with equal probability: p is the share of all
+    sign choices whose total is at least as far from 0. The unit is the scene. With one execution a scene this is
+    McNemar's exact test.
     """
     shared = [scene for scene in ours if scene in theirs]
     differences = [ours[scene] - theirs[scene] for scene in shared]
@@ -141,7 +140,7 @@ def difference_interval(ours: Mapping[Scene, Fraction], theirs: Mapping[Scene, F
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Corrected for the number of comparisons (Holm 1979), in the same order; NaN stays, and counts as none."""
+    """p-values corrected by Holm's method (Holm 1979), in the same order; NaN is no comparison and stays NaN."""
     corrected = [math.nan] * len(p_values)
     known = sorted((p, index) for index, p in enumerate(p_values) if not math.isnan(p))
     largest = 0.0
@@ -195,8 +194,8 @@ class Comparison:
 class Summary:
     """The success of the variants of ``suite``, counted from those of ``episodes`` that belong to it.
 
-    Variants that differ in nothing but the set of demonstrations are one, whose rates are averages over the sets. Where
-    a variant was shown different demonstrations of one task and set, those shown last count.
+    Variants that differ only in the set of demonstrations are one variant; its rates are averages over the sets. If a
+    variant was run with different demonstrations of one task and set, the last ones count.
     """
 
     def __init__(self, suite: Suite, episodes: Iterable[Episode]):
@@ -218,7 +217,7 @@ class Summary:
             ]
         self.rows: list[Episode] = [row for rows in self._rows.values() for row in rows]
         known = [variant for variant, rows in self._rows.items() if rows]
-        # whatever the order in which they were asked for, run by run
+        # a fixed order, independent of the order of the runs
         self.variants: list[Variant] = sorted(known, key=lambda variant: ROW_METHODS.index(variant.method))
         self.labels: dict[Variant, str] = dict(zip(self.variants, labels(self.variants), strict=True))
         self.tasks: list[str] = [task for task in suite.tasks if any(row.scene.task == task for row in self.rows)]
@@ -237,7 +236,7 @@ class Summary:
         return [rate for task in tasks if (rate := self.rate(variant, task)) is not None]
 
     def of_tasks(self, variant: Variant, beside: Variant | None = None) -> list[float]:
-        """The success rate in each task that the variant was tried in, and ``beside``, if given, was tried in, too."""
+        """The success rate in each task in which the variant, and ``beside`` if given, was tried."""
         tasks = (task for task in self.tasks if beside is None or self.rate(beside, task) is not None)
         return [rate.value for rate in self.rates(variant, tasks)]
 
@@ -289,12 +288,12 @@ class Summary:
 
 
 def of_any_set(variant: Variant) -> Variant:
-    """What variants have in common that differ in the set of demonstrations only."""
+    """``variant`` without its set of demonstrations."""
     return replace(variant, demo_set=0)
 
 
 def _means_of_scenes(rows: Iterable[Episode]) -> dict[Scene, Fraction]:
-    """The share of executions that succeeded, scene by scene; sets of demonstrations count alike."""
+    """Success rate of each scene: the average over sets of demonstrations."""
     counts: dict[Scene, dict[int, tuple[int, int]]] = {}
     for row in rows:
         of_sets = counts.setdefault(row.scene, {})

@@ -205,7 +205,7 @@ class Workbench:
                     )
                 except UNPLANNABLE as error:
                     self._policies[variant] = StandIn(partial(_refuse, error))
-            else:  # in closed loop; what it has after `fit` only makes it no `ClosedLoopPolicy` for isinstance yet
+            else:  # closed loop; it satisfies `ClosedLoopPolicy` only after `fit`
                 shown = self._read_demonstrations(self._place[0], variant.demos, with_images=True)
                 self._policies[variant] = cast(ClosedLoopPolicy, policy).fit(shown)
         return self._policies[variant]
@@ -280,7 +280,7 @@ class RememberingPolicy:
 
 @dataclass(frozen=True)
 class StandIn:
-    """In place of a fitted policy: ``make`` returns the plan for the current scene, or raises why there is none."""
+    """Replaces a fitted policy: ``make`` returns the plan for the current scene, or raises an error."""
 
     make: Callable[[], Plan]
 

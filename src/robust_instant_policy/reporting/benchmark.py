@@ -1,4 +1,4 @@
-"""Tables and figure of a benchmark of other people: by group of difficulty beside published numbers, by task, and the
+"""Tables and figure of a published benchmark: success by group of difficulty beside published numbers and by task, and
 failures by stage."""
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def _mean(summary: Summary, variant: Variant, tasks: Sequence[str]) -> float | N
 
 
 def _cell(summary: Summary, variant: Variant, tasks: Sequence[str]) -> str:
-    """`_mean`, and in parentheses of how many tasks where it is not of all."""
+    """`_mean`; in parentheses the number of tasks, if not all were tried."""
     mean = _mean(summary, variant, tasks)
     if mean is None:
         return NONE
@@ -170,7 +170,7 @@ def _conditions(summary: Summary) -> str:
 
 
 def _extent(summary: Summary) -> str:
-    """How many scenes and sets of demonstrations the numbers of each method are of."""
+    """Number of scenes and sets of demonstrations of each method."""
     told: dict[str, list[str]] = {}
     for variant, label in summary.labels.items():
         scenes = {rate.scenes for rate in summary.rates(variant, summary.tasks)}

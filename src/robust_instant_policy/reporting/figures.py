@@ -46,7 +46,7 @@ PARAMETERS = {
 
 @dataclass(frozen=True)
 class Style:
-    """How a method is drawn: brightness, hatch, marker and line differ, so that colour is not needed."""
+    """How a method is drawn. Brightness, hatch, marker and line differ, so that colour is not needed."""
 
     colour: str
     hatch: str
@@ -175,7 +175,7 @@ def _demos(summary: Summary) -> Figure:
     groups = by_demos(summary.variants)
     for number, (label, of_count) in enumerate(groups.items()):
         shown = [of_count[count] for count in sorted(of_count)]
-        # a little apart, so that methods that do equally well can be told apart
+        # shifted, so that equal curves do not cover each other
         places = [counts.index(one.demos) + 0.06 * (number - (len(groups) - 1) / 2) for one in shown]
         _curve(axes, summary, shown, places, style_of(shown[0]), label)
     axes.set_xticks(range(len(counts)), [str(count) for count in counts])

@@ -1,4 +1,4 @@
-"""Camera images with keypoints and paths drawn over them, in the values that the template `picture` draws."""
+"""Camera images with keypoints and paths over them, as values for the template `picture`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KEYPOINT_COLOURS = (
 
 @dataclass(frozen=True)
 class Mark:
-    """A keypoint at the pixel ``(u, v)``, and where it should be, if that is known."""
+    """A keypoint at the pixel ``(u, v)``, and its true position, if that is known."""
 
     u: float
     v: float

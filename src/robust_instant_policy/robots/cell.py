@@ -46,7 +46,7 @@ FIRST_RUN_SPEED = 0.25  # share of the usual speed, until a first run in a cell 
 
 
 class Section:
-    """A table of a TOML file whose keys are taken one by one; errors name the file, the key and what it should be."""
+    """A table of a TOML file. Its keys are read one by one; errors name the file, the key and the expected value."""
 
     def __init__(self, values: Mapping[str, Any], where: str):
         self._values, self._where = dict(values), where
@@ -133,12 +133,12 @@ class Section:
         return [Section(one, f"{self._where}: {key}[{index}]") for index, one in enumerate(value)]
 
     def rest(self) -> Mapping[str, Any]:
-        """What was not taken yet, for a driver that reads it as a `Section` of its own."""
+        """The keys that were not read yet, for a driver."""
         values, self._values = self._values, {}
         return MappingProxyType(values)
 
     def finish(self) -> None:
-        """Raises `CellError` for a key that nobody took: a misspelt one would be ignored."""
+        """Raises `CellError` for a key that was not read: it is misspelt."""
         for key in self._values:
             raise self.error(key, "is not known here; is it misspelt?")
 
@@ -321,7 +321,7 @@ def _limits(cell: Section) -> Limits:
 
 
 def _name(section: Section, default: str | None = None) -> str:
-    """A name that may stand in a file's name and in an address."""
+    """A name that is valid in file names and addresses."""
     name = section.text("name", default)
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise section.error("name", f"must be letters, digits, _, . and -, not {name!r}")

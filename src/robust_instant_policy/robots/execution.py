@@ -1,4 +1,4 @@
-"""What stands between a camera, a plan and a motion of real arms: the checks that refuse."""
+"""Checks between a camera image, a plan and a motion of real arms, and the motions before a plan."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def require_trust(config: CellConfig, confidence: float | None, cell: str) -> No
 
 
 def is_parked(station: Station) -> bool:
-    """Whether all arms are where a plan begins."""
+    """Whether all arms are at their park poses, where a plan begins."""
     states = station.states()
     away = [np.abs(state.joints - arm.home).max() for state, arm in zip(states, station.arms, strict=True)]
     return max(away) <= START_RAD
@@ -75,7 +75,7 @@ def has_open_grippers(station: Station) -> bool:
 
 
 def open_grippers(station: Station, stop: StopRequest) -> None:
-    """Open all grippers, whatever they hold; arms keep their joints."""
+    """Open all grippers, also those that hold something; joints do not move."""
     steps = count(1)
     seconds = max(OPENING_S, *(OPENING_MARGIN * arm.finger_travel / arm.finger_speed for arm in station.arms))
 

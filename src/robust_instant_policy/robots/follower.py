@@ -24,7 +24,7 @@ class Follower(Device, Protocol):
         ...
 
     def command(self, command: Command) -> None:
-        """Go on to ``command``, one control step ahead. Returns without waiting for the motion."""
+        """Move to ``command``, one control step ahead. Returns without waiting for the motion."""
         ...
 
     def stop(self) -> None:

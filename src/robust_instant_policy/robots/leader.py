@@ -12,13 +12,13 @@ class Leader(Device, Protocol):
     """Commands one follower."""
 
     def start(self) -> None:
-        """Called before leading begins: where the leader was before does not matter."""
+        """Called before leading begins: forget earlier readings."""
         ...
 
     def read(self, follower: ArmState) -> Command:
         """The command for the follower now.
 
-        A leader arm returns its own joints; a keyboard or gamepad moves on from its last command, at first from
+        A leader arm returns its own joints; a keyboard or gamepad continues from its last command, the first time from
         the state of the ``follower``.
         """
         ...

@@ -1,4 +1,4 @@
-"""Models of known arms: kinematics from a URDF, gripper and limits from the makers' figures."""
+"""Models of known arms: kinematics from a URDF, gripper and limits from data sheets."""
 
 from __future__ import annotations
 

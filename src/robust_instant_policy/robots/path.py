@@ -1,4 +1,4 @@
-"""What a motion will sweep, what was commanded and measured, and what a gripper's width and force say about a grasp."""
+"""Space that a motion will sweep; commanded and measured paths; detection of empty grasps from width and force."""
 
 from __future__ import annotations
 
@@ -26,9 +26,8 @@ ARRAYS = ("rate_hz", "commanded", "measured", "commanded_tools", "measured_tools
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """What a motion will sweep, metres in the world: the points between the fingertips ``tools (N, A, 3)`` at each
-    step, and at some ``seconds (S,)`` the middle lines ``links (S, C, 2, 3)`` of the capsules around the arms' links.
-    """
+    """Space that a motion sweeps, metres, world: points between the fingertips ``tools (N, A, 3)`` at each step, and at
+    some ``seconds (S,)`` the axes ``links (S, C, 2, 3)`` of the capsules around the arms' links."""
 
     tools: FloatArray
     links: FloatArray

@@ -20,10 +20,10 @@ from robust_instant_policy.robots.operator import ENTER, Operator
 from robust_instant_policy.robots.station import Station
 from robust_instant_policy.trajectory import Trajectory
 
-APPROACH_RAD_S = 0.5  # at which a follower comes to its leader before both are coupled
+APPROACH_RAD_S = 0.5  # speed of a follower towards its leader before both are coupled
 WAIT_S = 1.5  # without progress, until the person is told
 PROGRESS_RAD = 1e-4  # in a step
-COUPLED_RAD = 0.05  # of each joint between leader and follower, from which they are coupled
+COUPLED_RAD = 0.05  # difference of each joint, below which leader and follower are coupled
 TRIGGER_CLOSES, TRIGGER_OPENS = 0.4, 0.6  # opening of the trigger; between them the gripper keeps its state
 STILL_M = 0.003  # by which gripper points move at most while nothing is shown
 STILL_KEPT_S = 0.1  # of rest that stays before the first and after the last motion
@@ -34,12 +34,11 @@ OnStep = Callable[[Sequence[Command], Sequence[float], Sequence[ArmState]], None
 
 
 class Following:
-    """What `Station.lead` asks in each step: where the followers shall go, from the leaders. An arm whose leader is
-    None holds.
+    """Commands for each step of `Station.lead`, from the leaders; an arm whose leader is None holds.
 
-    ``key`` is the key that ended it, "" where a stop was requested. Grippers open and close completely, as they will
-    when a plan is executed. ``on_step`` is called in each step while leaders and followers are coupled: with the last
-    commands, the travel of each gripper, open or closed, and the states after them.
+    ``key`` is the key that ended it, "" after a request to stop. Grippers open and close completely, as in the
+    execution of a plan. While leaders and followers are coupled, ``on_step`` is called in each step with the last
+    commands, the travel of each gripper (open or closed), and the states after them.
     """
 
     def __init__(

@@ -31,7 +31,7 @@ LATE_S = 5e-3  # deviation of a step that 95% of the steps must keep within
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What is needed to record demonstrations of a task; all devices are connected.
+    """Records demonstrations of a task; all devices are connected.
 
     ``writer`` is of the folder; ``show(observation)`` shows a start image and the keypoints found in it;
     ``next_scene()`` prepares an emulated scene and returns its seed, None where a person arranges it.

@@ -88,7 +88,7 @@ class Station:
             raise CellError(f"{config.path}: the arms of a cell must have as many joints as each other, not {counts}")
         most, least = EMULATED_STALE_S
         stale_s = STALE_S if config.emulation is None else max(most / config.pace, least)
-        self.sent_at = 0.0  # of the last command, seconds of a clock that does not jump
+        self.sent_at = 0.0  # of the last command, seconds of `time.monotonic`
         self.gate = Gate(self.arms, config.limits, config.rate_hz, stale_s)
 
     def __enter__(self) -> Station:

@@ -68,7 +68,7 @@ def make_app(planner: Planner, host: str, key: str | None, debug: bool = False) 
 
 
 def _tell(error: BaseException, debug: bool) -> str:
-    """What a client is told of an error: one line, or with ``debug`` its traceback."""
+    """The error as one line, or with ``debug`` its traceback."""
     if debug:
         return "".join(traceback.format_exception(error))
     return str(error) if isinstance(error, RipError) else f"unexpected {type(error).__name__} in the server"

@@ -1,4 +1,4 @@
-"""Who holds the controls: one browser; the others watch."""
+"""Only one browser controls the page; the others watch."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ NOTE_S = 4.0
 
 
 class Controls:
-    """Lets the events of one browser through. The first to come holds the controls until it leaves or another one
-    presses the button that only onlookers have."""
+    """Accepts the events of one browser only: the first one, until it leaves or another one takes the controls with a
+    button."""
 
     def __init__(self, server: viser.ViserServer):
         self._server = server

@@ -1,4 +1,4 @@
-"""Geometry that the page shows; nothing here knows the browser."""
+"""Geometry that the page shows, independent of the browser."""
 
 from __future__ import annotations
 

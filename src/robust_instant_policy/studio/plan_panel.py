@@ -113,7 +113,7 @@ class PlanPanel:
         self._show_points()
 
     def _show_points(self) -> None:
-        """What the camera saw, where it is asked for, or where there is nothing else to see."""
+        """Show the point cloud if it is wanted, or if there is nothing else to show."""
         cell = self._session.cell
         wanted = self._points.value or (cell is not None and not cell.arms)
         self._stage.show_points(self._observation if wanted else None)

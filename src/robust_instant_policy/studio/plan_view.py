@@ -1,4 +1,4 @@
-"""What of a plan is drawn in the 3-D scene."""
+"""Draws a plan in the 3-D scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planning beside the running cell: stages that can be cancelled, and regressions that are drawn again at once."""
+"""Planning in a thread beside the running cell: stages can be cancelled, regressions are repeated at once."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from robust_instant_policy.policies.aggregation import agree, take_first
 from robust_instant_policy.policies.sampling import MIN_CANDIDATES, NO_SAMPLES
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
-DRAG_REACH = 0.12  # share of the trajectory's time over which a candidate that is dragged away gives way
-CLOSE_TIMEOUT_S = 5.0  # for the stage of a cancelled plan to end; a model that is busy longer is left to the system
+DRAG_REACH = 0.12  # standard deviation, in normalised time, of the bump that a drag adds to a candidate
+CLOSE_TIMEOUT_S = 5.0  # for the stage of a cancelled plan to end; a model that is busy longer is not closed
 PAPER_ESTIMATOR = "em-number"  # the model of the paper's networks, fitted exactly in milliseconds
 
 
 @dataclass(frozen=True)
 class Choices:
-    """What is drawn again at once: ``queries`` Q of the candidates, ``dof`` ν, ``estimator``, and ``noise`` in metres
-    (standard deviation) added to the candidates. ``dragged`` are candidates that a person moved: index to the time
-    in [0, 1] and the shift ``(3,)`` in metres there."""
+    """Settings that redraw the plan at once: ``queries`` Q, ``dof`` ν, ``estimator``, and ``noise`` (standard deviation,
+    metres) of the candidates. ``dragged`` are candidates that a person moved: index to the time in [0, 1] and the
+    shift ``(3,)`` in metres there."""
 
     queries: int = 5
     dof: float = 1.5
@@ -53,7 +53,7 @@ class Choices:
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """Everything that is known about one scene; ``candidates`` as the language model gave them so far."""
+    """What is known about one scene: the ``proposal`` has the candidates of the language model so far."""
 
     context: Context
     scene: LocatedScene

@@ -1,4 +1,4 @@
-"""A translucent ghost of the arms that goes along a plan."""
+"""Animation of a plan: a translucent copy of the arms moves along it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COLOUR, OPACITY = (46, 134, 171), 0.35
 
 
 class Preview:
-    """Shows one ghost at a time in ``scene``, in a thread of its own."""
+    """Shows one animation at a time in ``scene``, in its own thread."""
 
     def __init__(self, scene: viser.SceneApi):
         self._scene = scene
@@ -33,8 +33,8 @@ class Preview:
         self._stopped.set()
 
     def start(self, trajectory: Trajectory, cell: Cell | None) -> None:
-        """Let a ghost of the arms of ``cell``, or of the gripper's three points where there are none, go along
-        ``trajectory``. Raises `UnreachableError`."""
+        """Move a copy of the arms of ``cell``, or of the gripper's three points if it has none, along ``trajectory``.
+        Raises `UnreachableError`."""
         self.stop()
         self._stopped = stopped = threading.Event()
         if cell is None or not cell.arms:

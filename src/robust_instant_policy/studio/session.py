@@ -1,4 +1,4 @@
-"""A cell in real time, in one thread: arms that follow a person or play a plan, and demonstrations that are kept."""
+"""Runs a cell in real time, in one thread: arms follow a person or play a plan; demonstrations are stored."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Status:
 
 
 class Watcher(Protocol):
-    """What a session tells about; every method is called in its thread."""
+    """Receives the events of a session; all methods are called in its thread."""
 
     def on_scene(self, cell: Cell, observation: Observation) -> None:
         """There is a new scene."""
@@ -67,7 +67,7 @@ class Watcher(Protocol):
 
 
 class Session:
-    """Runs `run` until `stop`; all other methods belong into its thread, where `post` has them called."""
+    """`run` returns after `stop`; all other methods must be called in its thread, by `post`."""
 
     def __init__(self, watcher: Watcher):
         self.cell: Cell | None = None

@@ -24,7 +24,7 @@ REFUSED = (214, 40, 57)
 
 
 class Stage:
-    """What of a cell is drawn in ``server``'s scene."""
+    """Draws a cell in ``server``'s scene."""
 
     def __init__(self, server: viser.ViserServer):
         self.scene = server.scene

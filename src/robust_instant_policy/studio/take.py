@@ -1,4 +1,4 @@
-"""One demonstration in the making, and what becomes of it: pauses cut, small shakes smoothed."""
+"""A demonstration while it is recorded, and its editing: pauses are cut, small vibrations smoothed."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Take:
 
 
 def edited(poses: FloatArray, closed: np.ndarray, rate_hz: float) -> tuple[FloatArray, np.ndarray]:
-    """Tool ``poses (N, A, 4, 4)`` and states ``closed (N, A)`` at ``rate_hz`` without long pauses and shakes.
+    """Tool ``poses (N, A, 4, 4)`` and states ``closed (N, A)`` at ``rate_hz`` without long pauses and vibrations.
 
     A pause is shortened to `LONGEST_PAUSE_S`. Positions and rotations between two gripper changes are smoothed with a
     Gaussian of `SMOOTH_S`; the poses at which a gripper changes stay where they are.

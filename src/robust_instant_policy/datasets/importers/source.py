@@ -41,7 +41,7 @@ class Rig:
     ``triangle`` is the gripper of the imported trajectories, that of the executing robot. ``camera`` names the camera
     of the start image. ``intrinsics (3, 3)``, ``camera_pose (4, 4)`` camera to world, OpenCV axes; ``tool (4, 4)`` the
     tool frame of `geometry` within the recorded end-effector frame; ``gripper`` the meaning of the last action or of
-    the gripper's position; ``rate_hz`` the rate of the frames, whatever their timestamps say.
+    the gripper's position; ``rate_hz`` the rate of the frames, in place of their timestamps.
 
     For LeRobot datasets, ``depth_key`` is the feature with the depth and ``depth_unit_m`` the metres per step, where
     the dataset does not say it; ``pose_key`` the one with the poses, ``rotation`` one of `layouts.ROTATIONS`, where

@@ -1,4 +1,4 @@
-"""What a person is led through to calibrate: touching, holding, photographing, copying."""
+"""Calibrations with a person: touching, holding and photographing the board, copying joints."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COUPLED = "coupled: Enter takes the reading"
 
 
 class Guide:
-    """Leads a person who moves arm ``index`` of a connected station with its leader."""
+    """Guides a person who moves arm ``index`` of a connected station with its leader."""
 
     def __init__(self, station: Station, leader: Leader, index: int, operator: Operator):
         self._station, self._index, self._operator = station, index, operator
@@ -79,7 +79,7 @@ def _photograph(camera: Camera, board: Board, operator: Operator) -> Frame | Non
 
 
 def copied_turns(station: Station, source: JointSource, index: int, operator: Operator) -> JointMap:
-    """The joint map of a leader arm whose person copies what arm ``index`` shows, one joint after another."""
+    """Joint map of a leader arm: arm ``index`` turns joint after joint, and the person copies it with the leader."""
     rest = station.states()[index].joints
     _wait(operator, "give the leader the same pose as the follower; Enter")
     joints, readings = [rest], [source.angles()]

@@ -54,9 +54,9 @@ def make_camera(config: DeviceConfig, relative_to: Path) -> VideoCamera:
 
 
 def made_by(factory: str, where: str) -> Any:
-    """What the callable ``module:name`` of one's own makes; the module is installed or lies in the working directory.
+    """Call ``factory``, "module:function" of an installed module or of one in the working directory.
 
-    Raises `CellError` where it is not there, and for whatever it raises.
+    Raises `CellError` if it does not exist or raises an error.
     """
     module, _, attribute = factory.partition(":")
     if os.getcwd() not in sys.path:

@@ -1,4 +1,4 @@
-"""Starts the process of an emulated cell, and looks at it."""
+"""Starts the process of an emulated cell, and reads its state."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Emulation:
         return np.load(io.BytesIO(request(f"{self.url}/commands.npy")), allow_pickle=False)
 
     def times(self) -> FloatArray:
-        """When they executed them, ``(N,)`` seconds of the machine's clock that does not jump."""
+        """Times of these commands ``(N,)``, seconds of `time.monotonic`."""
         return np.load(io.BytesIO(request(f"{self.url}/times.npy")), allow_pickle=False)
 
     def failure(self) -> str:

@@ -26,7 +26,7 @@ RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORTS, GRIPPER_PORT = 30004, 29999, (30001, 30
 RATE_HZ = 125.0
 VERSION = (5, 11, 0, 0)
 
-# Types of the variables that are not six doubles, by name or beginning of the name.
+# Types of variables other than six doubles, by name or prefix.
 TYPES = {
     "DOUBLE": (
         "timestamp", "speed_scaling", "target_speed_fraction", "actual_momentum", "actual_main_voltage",
@@ -55,7 +55,7 @@ READY, DONE = 1, 2
 RUNNING, STOPPED = 2, 1  # runtime states
 NORMAL_BIT, PROTECTIVE_BIT = 0x01, 0x04  # of the safety status
 POWER_BIT, PROGRAM_BIT = 0x01, 0x02  # of the robot status
-# The emulation shares the processor with what uses it: times are longer than a controller's.
+# The emulation shares the processor with its client: times are longer than a controller's.
 SLACK = 100  # factor of the watchdog's time
 TIMEOUT_S, LATENCY_S = 0.9, 0.1  # of the gripper's answers; of states
 

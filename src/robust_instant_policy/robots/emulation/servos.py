@@ -34,7 +34,7 @@ PING, READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x0
 BROADCAST = 0xFE
 RANGE_ERROR, ACCESS_ERROR = 0x04, 0x07
 LOCKED_BELOW = 64  # registers of the EEPROM, which cannot be written with the torque on
-# The emulation shares the processor with what uses it: timeouts are twenty times those of real servos, the watchdog's
+# The emulation shares the processor with its client: timeouts are twenty times those of real servos, the watchdog's
 # a hundred times.
 EMULATED_TIMEOUT_MS, WATCHDOG_UNIT_S = 600.0, 2.0
 WATCHDOG_EXPIRED = 0xFF

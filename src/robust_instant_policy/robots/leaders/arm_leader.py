@@ -26,8 +26,8 @@ class JointSource(Device, Protocol):
 class ArmLeader:
     """See `robots.leader.Leader`; ``finger_travel`` is the follower's, metres.
 
-    Servos count turns from where they are switched on. So whole turns are chosen at the first reading after `start`,
-    as near as possible to the follower's joints, and followed from there.
+    Servos count turns from the angle at power-on. So at the first reading after `start`, the number of whole turns that
+    is nearest to the follower's joints is chosen; later readings are unwrapped from there.
     """
 
     def __init__(self, source: JointSource, joints: JointMap, finger_travel: float):

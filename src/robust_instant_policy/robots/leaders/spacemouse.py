@@ -45,7 +45,7 @@ class SpaceMouseSource:
 
     def start(self) -> None:
         self.step()
-        self._heard = -math.inf  # the last report may be old: the system keeps the first ones that nobody read
+        self._heard = -math.inf  # the last report may be old: the system buffers unread ones
 
     def step(self) -> tuple[FloatArray, bool]:
         presses = 0
