@@ -40,7 +40,7 @@ PAPER_ESTIMATOR = "em-number"  # the model of the paper's networks, fitted exact
 
 @dataclass(frozen=True)
 class Choices:
-    """Settings that redraw the plan at once: ``queries`` Q, ``dof`` ν, ``estimator``, and ``noise`` (standard deviation,
+    """Settings that redraw the plan: ``queries`` Q, ``dof`` ν, ``estimator``, and ``noise`` (standard deviation,
     metres) of the candidates. ``dragged`` are candidates that a person moved: index to the time in [0, 1] and the
     shift ``(3,)`` in metres there."""
 
