@@ -19,9 +19,8 @@ from robust_instant_policy.cli import main
 from robust_instant_policy.datasets.images import encode_depth, encode_image
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import UsageError
-from robust_instant_policy.network import listen
+from robust_instant_policy.network import checked_key, listen
 from robust_instant_policy.policies import Neighbours
-from robust_instant_policy.serving.address import checked_key
 from robust_instant_policy.serving.messages import pack, unpack
 from robust_instant_policy.serving.planner import Planner
 from robust_instant_policy.serving.server import serve

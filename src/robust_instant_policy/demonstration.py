@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import zipfile
 import zlib
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from robust_instant_policy.checks import checked_array, checked_pose, checked_positive
 from robust_instant_policy.errors import DatasetError, InvalidValueError
-from robust_instant_policy.files import open_regular, write_whole
+from robust_instant_policy.files import npz, open_regular, write_whole
 from robust_instant_policy.geometry import FloatArray, as_numbers, lift
 from robust_instant_policy.trajectory import Trajectory
 
@@ -106,9 +105,7 @@ class Observation:
 
     def npz(self) -> bytes:
         """The content of such a file."""
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **{name: getattr(self, name) for name in ARRAYS})
-        return buffer.getvalue()
+        return npz({name: getattr(self, name) for name in ARRAYS})
 
 
 def _check_intrinsics(intrinsics: FloatArray, height: int, width: int) -> None:

@@ -98,11 +98,11 @@ def _whole(digits: str) -> int:
     return int(digits)
 
 
-def save_arrays(path: Path, arrays: Mapping[str, object]) -> None:
-    """Write a compressed ``.npz`` file."""
+def npz(arrays: Mapping[str, object]) -> bytes:
+    """The content of a compressed ``.npz`` file."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    write_whole(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def load_arrays(path: Path, names: Collection[str], advice: str) -> dict[str, NDArray]:

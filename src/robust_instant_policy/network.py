@@ -11,6 +11,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 from robust_instant_policy.errors import UsageError
 
+KEY_VARIABLE = "RIP_SERVE_KEY"
+
 
 def listen(host: str, port: int) -> socket.socket:
     """A listening socket; port 0 takes a free one. Raises `UsageError`."""
@@ -22,6 +24,14 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         reason = str(error.strerror).partition(" (while")[0]
     raise UsageError(f"cannot listen at {host} port {port} ({reason}); choose another with --host, --port")
+
+
+def checked_key(host: str, key: str | None) -> str | None:
+    """The key that clients must give. Raises `UsageError` for a server that others can reach and that has none."""
+    key = (key or "").strip()  # HTTP strips headers, too
+    if not key and not is_loopback(host):
+        raise UsageError(f"a server at {host} can be reached by others: set {KEY_VARIABLE} to a key, or use 127.0.0.1")
+    return key or None
 
 
 def is_loopback(host: str) -> bool:

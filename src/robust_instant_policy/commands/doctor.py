@@ -76,7 +76,9 @@ def examine(folder: Path) -> Iterator[Finding]:
     for key, needed in (("OPENAI_API_KEY", "for --llm openai:…"), ("RIP_API_KEY", "for other servers, --llm http…")):
         status = f"{key} is set" if os.environ.get(key) else f"{key} is not set; needed only {needed}"
         yield Finding(key, True, status)
-    free = shutil.disk_usage(_existing(folder)).free / 1e9
+    folder = folder.resolve()
+    existing = next(one for one in (folder, *folder.parents) if one.exists())
+    free = shutil.disk_usage(existing).free / 1e9
     yield Finding("disk", free >= NEEDED_DISK_GB, f"{free:.1f} GB free", f"free at least {NEEDED_DISK_GB:.0f} GB")
     if (memory := _available_memory_gb()) is not None:
         remedy = f"needs {NEEDED_MEMORY_GB:.0f} GB; close other programs"
@@ -117,13 +119,6 @@ def _features() -> str:
     from robust_instant_policy.perception.network import choose_network
 
     return choose_network("auto", PAPER_SIMULATION)[1].removeprefix("features: ")
-
-
-def _existing(folder: Path) -> Path:
-    folder = folder.resolve()
-    while not folder.exists():
-        folder = folder.parent
-    return folder
 
 
 def _available_memory_gb() -> float | None:

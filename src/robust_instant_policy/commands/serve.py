@@ -10,8 +10,7 @@ from robust_instant_policy.commands.options import add_demos, add_method, natura
 from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.errors import needs_extra
-from robust_instant_policy.network import listen
-from robust_instant_policy.serving.address import KEY_VARIABLE, checked_key
+from robust_instant_policy.network import KEY_VARIABLE, checked_key, listen
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

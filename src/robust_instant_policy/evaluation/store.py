@@ -6,7 +6,6 @@ exports; a folder that holds only exports can be read, too.
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import shlex
@@ -23,6 +22,7 @@ from urllib.parse import quote
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from robust_instant_policy.datasets.tables import parquet
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import Failure
@@ -312,9 +312,7 @@ def _write_exports(folder: Path, results: Results) -> None:
         (EPISODES_FILE, _EPISODES, results.episodes),
         (FAILURES_FILE, _FAILURES, results.failures),
     ):
-        buffer = io.BytesIO()
-        pq.write_table(table.arrow(rows), buffer)
-        write_whole(folder / name, buffer.getvalue())
+        write_whole(folder / name, parquet(table.arrow(rows)))
     results.manifest.write(folder / MANIFEST_FILE)
 
 

@@ -14,7 +14,7 @@ from plotly.offline import get_plotlyjs
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import load_arrays, parse_json, read_regular, save_arrays, write_whole
+from robust_instant_policy.files import load_arrays, npz, parse_json, read_regular, write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.policy import Plan, Stage
 from robust_instant_policy.reporting.charts import (
@@ -89,7 +89,7 @@ class RunRecord:
 def save_context(folder: Path, images: Sequence[NDArray[np.uint8]], pixels: FloatArray) -> None:
     """Store the demonstrations' start images and their keypoints' ``pixels (I, K, 2)`` beside the plan."""
     arrays = {f"rgb_{index}": image for index, image in enumerate(images)}
-    save_arrays(folder / CONTEXT_FILE, {"pixels": pixels, **arrays})
+    write_whole(folder / CONTEXT_FILE, npz({"pixels": pixels, **arrays}))
 
 
 def write_report(folder: str | Path) -> Path:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robust_instant_policy.files import load_arrays, save_arrays
+from robust_instant_policy.files import load_arrays, npz, write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.capsules import ArmShape
@@ -41,7 +41,7 @@ class Sweep:
         return cls(tool_points(motion.joints, arms), np.concatenate(links, axis=1), rows / rate_hz)
 
     def save(self, path: Path) -> None:
-        save_arrays(path, vars(self))
+        write_whole(path, npz(vars(self)))
 
     @classmethod
     def load(cls, path: Path) -> Sweep:
@@ -70,7 +70,7 @@ class MeasuredPath:
     seconds: FloatArray
 
     def save(self, path: Path) -> None:
-        save_arrays(path, vars(self))
+        write_whole(path, npz(vars(self)))
 
     @classmethod
     def load(cls, path: Path) -> MeasuredPath:
