@@ -54,8 +54,6 @@ TICK = Register(120, 2)  # milliseconds, wraps at 32768
 PRESENT_CURRENT = Register(126, 2, signed=True)
 PRESENT_VELOCITY = Register(128, 4, signed=True)
 PRESENT_POSITION = Register(132, 4, signed=True)
-TEMPERATURE = Register(146, 1)
-VOLTAGE = Register(144, 2)  # 0.1 V
 
 POSITION_MODE, CURRENT_POSITION_MODE = 3, 5
 TICK_TURN = 32768
