@@ -35,6 +35,9 @@ RESULTS_FILE = "results.sqlite"
 EPISODES_FILE, FAILURES_FILE = "episodes.parquet", "failures.parquet"
 BUSY_TIMEOUT_S = 60.0  # how long a write waits for another process
 
+SUITES = """CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, level TEXT, content TEXT NOT NULL,
+PRIMARY KEY (name, objects, assets, level))"""
+
 _SQL_TYPES = {str: "TEXT", int: "INTEGER", float: "REAL", bool: "INTEGER"}
 _ARROW_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 
@@ -90,7 +93,7 @@ class ResultsStore:
             is_new = not _EPISODES.columns(self._database)
             for table in (_EPISODES, _FAILURES, _INVOCATIONS):
                 table.create(self._database)
-            _create_suites(self._database)
+            self._database.execute(SUITES)
             if is_new:
                 self._take(_read_exports(folder))
 
@@ -272,20 +275,6 @@ _KEY = (*_columns_of(Scene), *_columns_of(Variant), "candidate")
 _EPISODES = _Table("episodes", Episode, _KEY)
 _FAILURES = _Table("failures", Failure, _KEY)
 _INVOCATIONS = _Table("invocations", Invocation, _columns_of(Invocation))
-
-
-def _create_suites(database: sqlite3.Connection) -> None:
-    """Make the table of suites, or make it anew from that of a version that knew no levels."""
-    columns = {row[1] for row in database.execute("PRAGMA table_info(suites)")}
-    if columns and "level" not in columns:
-        database.execute("ALTER TABLE suites RENAME TO older_suites")
-    database.execute(
-        "CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, level TEXT, content TEXT NOT NULL, "
-        "PRIMARY KEY (name, objects, assets, level))"
-    )
-    if columns and "level" not in columns:
-        database.execute("INSERT INTO suites SELECT name, objects, assets, 'paper', content FROM older_suites")
-        database.execute("DROP TABLE older_suites")
 
 
 def _read(database: sqlite3.Connection) -> Results:
