@@ -57,24 +57,6 @@ class Played:
             raise StoppedError(f"{self.stopped}; {known}")
 
 
-class Ticker:
-    """Absolute deadlines at a rate, on a clock that a change of the system's time does not touch."""
-
-    def __init__(self, rate_hz: float):
-        self._period = 1 / rate_hz
-        self._next = time.monotonic()
-
-    def wait(self) -> float:
-        """Sleep until the next deadline and return the time, seconds. A missed deadline is not caught up with."""
-        self._next += self._period
-        now = time.monotonic()
-        if self._next > now:
-            time.sleep(self._next - now)
-            return time.monotonic()
-        self._next = now
-        return now
-
-
 class Station:
     """The arms of a cell; a context manager that connects them, and at its end stops and disconnects them."""
 
@@ -173,9 +155,11 @@ class Station:
         self.gate.start(states)
         try:
             with _undisturbed():
-                ticker = Ticker(self.rate_hz * self.config.pace)
+                period, due = 1 / (self.rate_hz * self.config.pace), time.monotonic()
                 while (wanted := command(states)) is not None:
-                    now = self.sent_at = ticker.wait()
+                    due = max(due + period, time.monotonic())  # a missed deadline is not caught up with
+                    time.sleep(max(due - time.monotonic(), 0.0))
+                    now = self.sent_at = time.monotonic()
                     sent = checked(wanted)
                     for follower, one in zip(self.followers, sent, strict=True):
                         follower.command(one)

@@ -13,7 +13,6 @@ import time
 from collections.abc import Mapping
 from functools import partial
 from http.server import BaseHTTPRequestHandler
-from typing import Protocol
 
 import numpy as np
 
@@ -21,22 +20,12 @@ from robust_instant_policy.errors import CellError, RipError
 from robust_instant_policy.network import Answer, serve_loopback
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.controller import Controller
-from robust_instant_policy.robots.emulation.faults import FaultSwitch
 from robust_instant_policy.robots.emulation.servos import ServoBus
 from robust_instant_policy.robots.emulation.twin import SharedTwin, Twin
 from robust_instant_policy.robots.models import arm_of
 from robust_instant_policy.robots.priority import DEVICE, take_real_time
 
-
-class Device(Protocol):
-    """An emulated arm. ``options`` are those by which its driver finds it; ``limp`` whether it ever let go."""
-
-    fault: FaultSwitch
-    limp: bool
-
-    @property
-    def options(self) -> Mapping[str, str | float]: ...
-    def unplug(self) -> None: ...
+Device = ServoBus | Controller  # ``options``: by which the driver finds it; ``limp``: whether it ever let go
 
 
 def make_device(kind: str, twin: SharedTwin, index: int, finger_travel: float, pace: float) -> Device:
