@@ -215,7 +215,12 @@ class Controller:
                 "is in remote control": "true",
                 "robotmode": "Robotmode: RUNNING",
                 "safetystatus": f"Safetystatus: {'PROTECTIVE_STOP' if self._protective() else 'NORMAL'}",
+                "running": f"Program running: {str(self._running).lower()}",
+                "stop": "Stopped",
+                "quit": "Disconnected",
             }
+            if line.strip().lower() == "stop":
+                self._running = False
             connection.sendall((answers.get(line.strip().lower(), "could not understand") + "\n").encode())
 
     def _serve_gripper(self, connection: socket.socket) -> None:
