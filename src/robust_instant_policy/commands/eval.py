@@ -29,7 +29,6 @@ from robust_instant_policy.evaluation import (
     make_suites,
     run_suites,
 )
-from robust_instant_policy.evaluation.cluster import RayWorkers
 from robust_instant_policy.evaluation.processes import LocalWorkers
 from robust_instant_policy.evaluation.scenes import SPLITS, first_demonstration_seed
 from robust_instant_policy.evaluation.store import EPISODES_FILE
@@ -123,9 +122,11 @@ def run(options: argparse.Namespace) -> int:
         )
         for demo_set in sets
     ]
-    workers: Workers = (
-        LocalWorkers(options.workers or 1) if options.ray is None else RayWorkers(options.ray, options.workers)
-    )
+    workers: Workers = LocalWorkers(options.workers or 1)
+    if options.ray is not None:
+        from robust_instant_policy.evaluation.cluster import RayWorkers  # needs an extra
+
+        workers = RayWorkers(options.ray, options.workers)
     suites = make_suites(options.suite or ["chosen"], choice)
     asks = any(variant.method in ASKING_METHODS for suite in suites for variant in suite.variants)
     if asks and not options.replay and not (options.out / STORE_FILE).exists():  # which may hold all the answers

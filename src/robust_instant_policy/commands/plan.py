@@ -10,7 +10,6 @@ from robust_instant_policy.commands.options import add_demos, add_method, add_re
 from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.reporting.rerun_log import log_plan, open_recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,6 +30,8 @@ def run(options: argparse.Namespace) -> int:
         plan = policy.plan(observation)
     plan.save(options.out)
     if options.rerun is not None:
+        from robust_instant_policy.reporting.rerun_log import log_plan, open_recording  # needs an extra
+
         with open_recording(options.rerun, "plan") as recording:
             log_plan(recording, observation, plan)
     for note in plan.notes:

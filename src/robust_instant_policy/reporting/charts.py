@@ -72,8 +72,8 @@ def paths_in_space(plan: Plan, observation: Observation) -> go.Figure:
         _add_robust_path(figure, plan, arm)
     keypoints = plan.keypoints.reshape(-1, 3)
     numbers = range(len(keypoints))
-    marker = {"size": 5, "color": [keypoint_colour(k) for k in numbers]}
-    _add_points(figure, keypoints, "keypoints", mode="markers+text", text=[str(k) for k in numbers], marker=marker)
+    dots = {"size": 5, "color": [keypoint_colour(k) for k in numbers]}
+    _add_points(figure, keypoints, "keypoints", mode="markers+text", text=[str(k) for k in numbers], marker=dots)
     return _in_space(figure)
 
 

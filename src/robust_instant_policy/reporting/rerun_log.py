@@ -2,7 +2,7 @@
 
 The entities are the same for all: ``world/camera`` with ``rgb`` and ``depth``, ``world/points``, ``world/keypoints``,
 ``world/candidates/Q``, ``world/plan``, ``world/measured``, ``weights/Q``, ``notes``. Steps are the timeline ``step``.
-Needs the extra `rerun`.
+Importing it raises `MissingExtraError` without the extra `rerun`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -27,8 +27,9 @@ from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_F
 from robust_instant_policy.robots.path import MeasuredPath
 from robust_instant_policy.trajectory import Trajectory
 
-if TYPE_CHECKING:
+with needs_extra("rerun"):
     import rerun as rr
+    import rerun.blueprint as rrb
 
 LIVE = "live"  # in place of a file: a viewer, which is started where none runs
 DEFAULT_PORT = 9876  # of Rerun's viewer
@@ -45,11 +46,8 @@ def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
     """A recording called ``name``: in the file ``where`` (.rrd), shown by a viewer (`LIVE`), or sent to the address of
     one (``rerun+http://…``). It is complete when the block ends; a file takes its name then.
 
-    Raises `UsageError` for anything else, `MissingExtraError` without Rerun, `RipError` where no viewer answers and
-    where the file cannot be written.
+    Raises `UsageError` for anything else, `RipError` where no viewer answers and where the file cannot be written.
     """
-    with needs_extra("rerun"):
-        import rerun as rr
     recording = rr.RecordingStream("robust-instant-policy")
     try:
         part = _send_to(recording, where)
@@ -74,8 +72,6 @@ def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
 
 def _send_to(recording: rr.RecordingStream, where: str) -> Path | None:
     """Open ``where`` for the recording; returns the hidden neighbour of a file, to which it is written first."""
-    import rerun as rr
-
     if where.endswith(".rrd"):
         path = Path(where)
         require_replaceable(path)
@@ -109,8 +105,6 @@ def log_plan(
 ) -> None:
     """Log what ``plan`` saw and chose and, where it was executed, the way ``measured (N, A, 3)`` of the points between
     the fingertips, metres, world."""
-    import rerun as rr
-
     _log_observation(recording, observation)
     labels = [f"{index + 1}: {confidence:.2f}" for index, confidence in enumerate(plan.keypoint_confidence)]
     recording.log("world/keypoints", rr.Points3D(plan.keypoints, radii=KEYPOINT_M, labels=labels, show_labels=False))
@@ -141,8 +135,6 @@ def log_run(recording: rr.RecordingStream, folder: Path) -> None:
 
 def log_demonstrations(recording: rr.RecordingStream, demonstrations: Sequence[Demonstration]) -> None:
     """Log every demonstration at its place of the timeline ``demonstration``, with its images where it has some."""
-    import rerun as rr
-
     for index, demonstration in enumerate(demonstrations):
         recording.set_time("demonstration", sequence=index)
         recording.set_time("step", sequence=0)
@@ -158,8 +150,6 @@ def log_demonstrations(recording: rr.RecordingStream, demonstrations: Sequence[D
 
 
 def _log_observation(recording: rr.RecordingStream, observation: Observation) -> None:
-    import rerun as rr
-
     height, width = observation.depth.shape
     pose = observation.camera_pose
     recording.log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
@@ -175,8 +165,6 @@ def _log_observation(recording: rr.RecordingStream, observation: Observation) ->
 
 def _log_candidate(recording: rr.RecordingStream, index: int, candidate: Trajectory, plan: Plan) -> None:
     """A candidate's path, the fainter the lower its weight, and its weight at each step of the plan."""
-    import rerun as rr
-
     is_ignored = bool(plan.hallucinated[index])
     name = f"candidate {index + 1}" + (f", hallucinated from step {plan.onset[index]}" if is_ignored else "")
     pieces = _pieces(candidate)
@@ -203,8 +191,6 @@ def _pieces(trajectory: Trajectory) -> FloatArray:
 def _log_trajectory(recording: rr.RecordingStream, trajectory: Trajectory) -> None:
     """The way between the fingertips, in one colour where the gripper is open and in another where it is closed, and
     the gripper at each step: from one fingertip over the gripper point to the other one."""
-    import rerun as rr
-
     pieces = _pieces(trajectory)
     closed = trajectory.gripper_state[:-1].ravel() > 0.5
     colours = np.where(closed[:, None], CLOSED, OPEN).astype(np.uint8)
@@ -216,8 +202,6 @@ def _log_trajectory(recording: rr.RecordingStream, trajectory: Trajectory) -> No
 
 
 def _blueprint() -> Any:
-    import rerun.blueprint as rrb
-
     space = rrb.Spatial3DView(origin="/", contents=["+ /world/**", "- /world/camera/depth"], name="scene and paths")
     image = rrb.Spatial2DView(origin="/world/camera", contents=["+ $origin/**", "- $origin/depth"], name="camera")
     depth = rrb.Spatial2DView(origin="/world/camera", contents=["+ $origin/depth"], name="depth")

@@ -9,10 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.importers.hdf5 import members, open_hdf5
 from robust_instant_policy.datasets.importers.lerobot import read_lerobot
-from robust_instant_policy.datasets.importers.maniskill import read_maniskill
-from robust_instant_policy.datasets.importers.robomimic import read_robomimic
 from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode
 from robust_instant_policy.datasets.reader import load_demonstrations
 from robust_instant_policy.datasets.writer import DatasetWriter
@@ -72,6 +69,10 @@ def _open(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
         if (path / layout.INFO_PATH).exists():
             return read_lerobot(path, rig)
     else:
+        from robust_instant_policy.datasets.importers.hdf5 import members, open_hdf5  # these need an extra
+        from robust_instant_policy.datasets.importers.maniskill import read_maniskill
+        from robust_instant_policy.datasets.importers.robomimic import read_robomimic
+
         with open_hdf5(path) as file:
             names = set(members(file, "/"))
             robomimic = bool(members(file, "data"))

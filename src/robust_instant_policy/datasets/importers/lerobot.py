@@ -19,9 +19,8 @@ from robust_instant_policy.datasets import coded_depth, layout
 from robust_instant_policy.datasets.folder import Folder, open_folder
 from robust_instant_policy.datasets.images import decode_image
 from robust_instant_policy.datasets.importers.depth import PIXEL_FORMAT, dequantised, is_depth, unit_of
-from robust_instant_policy.datasets.importers.hdf5 import choose_camera
 from robust_instant_policy.datasets.importers.lerobot_poses import grippers_in, poses_in
-from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode
+from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode, choose_camera
 from robust_instant_policy.datasets.importers.timing import even_steps, held, resampled, seconds_of
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt
