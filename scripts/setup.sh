@@ -96,9 +96,9 @@ python=$(find_python) || {
 }
 say "using $($python --version)"
 
-# Libraries that wheels link to but do not carry: OpenCV's OpenGL, the simulator's Vulkan loader and X11.
+# Libraries that wheels link to but do not carry: OpenCV's OpenGL, the simulator's Vulkan loader and X11, RealSense's libusb.
 missing=()
-for library in libGL.so.1:libgl1 libX11.so.6:libx11-6 libvulkan.so.1:libvulkan1 libgomp.so.1:libgomp1 libglib-2.0.so.0:libglib2.0-0; do
+for library in libGL.so.1:libgl1 libX11.so.6:libx11-6 libvulkan.so.1:libvulkan1 libgomp.so.1:libgomp1 libglib-2.0.so.0:libglib2.0-0 libusb-1.0.so.0:libusb-1.0-0; do
   ldconfig -p 2>/dev/null | grep -q "${library%%:*}" || /sbin/ldconfig -p | grep -q "${library%%:*}" || missing+=("${library##*:}")
 done
 [ -e /etc/ssl/certs/ca-certificates.crt ] || missing+=(ca-certificates)

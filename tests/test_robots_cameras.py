@@ -1,6 +1,7 @@
 """Cameras: the RealSense reader on the SDK's software device, LeRobot's shape, and a folder."""
 
 import itertools
+import sys
 import threading
 import time
 
@@ -12,6 +13,7 @@ from robust_instant_policy.errors import CellError, RobotError
 from robust_instant_policy.robots.calibration import Board
 from robust_instant_policy.robots.calibration.board_pose import reprojection_px
 from robust_instant_policy.robots.cameras import LeRobotCamera, RealSenseCamera, RecordedCamera, make_camera
+from robust_instant_policy.robots.cameras.realsense import sdk
 from robust_instant_policy.robots.cell import DeviceConfig
 from tests.charuco import photograph
 
@@ -217,6 +219,14 @@ class Shape:
 
     def disconnect(self):
         self.is_connected = False
+
+
+def test_a_system_library_that_is_missing_is_named(monkeypatch, tmp_path):
+    (tmp_path / "pyrealsense2.py").write_text("raise ImportError('libusb-1.0.so.0: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pyrealsense2")
+    with pytest.raises(RobotError, match=r"libusb-1\.0\.so\.0.* apt install libusb-1.0-0"):
+        sdk()
 
 
 def test_a_lerobot_camera_is_read_in_metres_and_only_with_aligned_depth():

@@ -58,7 +58,8 @@ class Observation:
         camera_pose = checked_pose("camera_pose", self.camera_pose)
         if np.abs(camera_pose[:3, 3]).max() > FARTHEST_CAMERA_M:
             raise InvalidValueError(f"camera_pose puts the camera at {camera_pose[:3, 3]}; is that in metres?")
-        for name, value in zip(ARRAYS, (rgb, depth, intrinsics, camera_pose), strict=True):
+        arrays: tuple[NDArray, ...] = (rgb, depth, intrinsics, camera_pose)
+        for name, value in zip(ARRAYS, arrays, strict=True):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
 

@@ -155,7 +155,7 @@ class Board:
 
 
 def opencv() -> Any:
-    """The module ``cv2``; raises `MissingExtraError` where it is not installed."""
-    with needs_extra("robots"):
+    """The module ``cv2``; raises `MissingExtraError` or `RobotError` where it cannot be imported."""
+    with needs_extra("robots", library="libgl1"):
         import cv2
     return cv2

@@ -164,8 +164,8 @@ class RealSenseCamera:
 
 
 def sdk() -> Any:
-    """The module ``pyrealsense2``; raises `MissingExtraError` where it is not installed."""
-    with needs_extra("robots"):
+    """The module ``pyrealsense2``; raises `MissingExtraError` or `RobotError` where it cannot be imported."""
+    with needs_extra("robots", library="libusb-1.0-0"):
         import pyrealsense2
     return pyrealsense2
 
