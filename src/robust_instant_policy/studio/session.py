@@ -314,11 +314,9 @@ class Session:
             if refusal != self.status.refusal:
                 self._set(refusal=refusal)
             if motion is not None:
-                if phase == "ready":
+                if phase == "ready":  # a demonstration begins open, at home
                     phase = "recording"
-                    self._steps.extend(
-                        _steps_of(Motion.at_home(self.cell.arms))
-                    )  # a demonstration begins open, at home
+                    self._steps.extend(_steps_of(Motion.at_home(self.cell.arms)))
                 self._steps.extend(_steps_of(motion))
         if phase == "ready":
             return  # the scene waits, so that a recording can be replayed from its beginning
