@@ -2,7 +2,9 @@
 
 import itertools
 import os
+import tomllib
 from contextlib import nullcontext
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ pytest.importorskip("dynamixel_sdk")
 from robust_instant_policy.cli import main
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import GripperTriangle, invert_pose, make_pose, transform_points
-from robust_instant_policy.robots.calibration import Board, CameraCalibration, in_hand, on_table, touched_place
+from robust_instant_policy.robots.calibration import Board, in_hand, on_table, touched_place
 from robust_instant_policy.robots.calibration.guided import Guide, photograph_places
 from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cell import CellConfig, read_gripper
@@ -206,7 +208,7 @@ def test_the_command_calibrates_from_a_board_at_a_stated_place(tmp_path, monkeyp
     assert main([*command, "--place", "-0.15", "-0.1", "0", "0"]) == 0
     _, angle = error_of(CellConfig.load(robot).camera_pose, CAMERA)
     assert angle < 0.1
-    assert CameraCalibration.load(tmp_path / "camera.toml").board == BOARD
+    assert tomllib.loads((tmp_path / "camera.toml").read_text())["board"] == asdict(BOARD)
     assert "left out one by one: median 0." in capsys.readouterr().out
     answer(monkeypatch, "\n")
     assert main([*command, "--place", "-0.15", "-0.1", "0", "0"]) == 1

@@ -31,11 +31,6 @@ FILM_OPTIONS = {"preset": "veryfast", "crf": "26"}  # for videos in pages: a ten
 MAX_RATE_DENOMINATOR = 1001  # as in 30000/1001 Hz
 
 
-def rate_fraction(rate_hz: float) -> Fraction:
-    """The rate as a ratio, for the clock of a video."""
-    return Fraction(rate_hz).limit_denominator(MAX_RATE_DENOMINATOR)
-
-
 class VideoEncoder:
     """Encodes images ``(H, W, 3)`` uint8, H and W even, one by one as MP4.
 
@@ -44,7 +39,7 @@ class VideoEncoder:
     """
 
     def __init__(self, rate_hz: float, options: Mapping[str, str] = X264_OPTIONS):
-        self._rate = rate_fraction(rate_hz)
+        self._rate = Fraction(rate_hz).limit_denominator(MAX_RATE_DENOMINATOR)  # for the clock of the video
         self._buffer = io.BytesIO()
         self._container = av.open(self._buffer, "w", format="mp4")
         self._stream = self._container.add_stream(CODEC, rate=self._rate)

@@ -25,27 +25,19 @@ CONFIDENCE = 0.95
 RESAMPLES = 10_000  # of the bootstrap
 
 
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95% confidence interval of a success rate (Wilson 1927); (0, 1) without trials."""
+def wilson_interval(successes: float, trials: int) -> tuple[float, float]:
+    """95% confidence interval of a success rate (Wilson 1927); (0, 1) without trials.
+
+    A trial is a scene, and ``successes`` the sum of the success rates in the scenes. The rate of a scene with several
+    executions varies at most as much as a single execution with that probability, so the interval is not too narrow.
+    """
     if not 0 <= successes <= trials:
         raise InvalidValueError(f"successes must lie between 0 and trials, got {successes} of {trials}")
     if trials == 0:
         return 0.0, 1.0
-    interval = stats.binomtest(successes, trials).proportion_ci(method="wilson")
-    return float(interval.low), float(interval.high)
-
-
-def scene_interval(mean: float, scenes: int) -> tuple[float, float]:
-    """95% confidence interval of the ``mean`` of the success rates in so many ``scenes``; (0, 1) without scenes.
-
-    Wilson's interval (Wilson 1927) with one trial a scene. The rate of a scene with several executions varies at most
-    as much as a single execution with that probability, so the interval is not too narrow.
-    """
-    if scenes == 0:
-        return 0.0, 1.0
-    z = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
-    middle = (mean + z**2 / (2 * scenes)) / (1 + z**2 / scenes)
-    half = z / (1 + z**2 / scenes) * math.sqrt(mean * (1 - mean) / scenes + z**2 / (4 * scenes**2))
+    z, mean = float(stats.norm.ppf((1 + CONFIDENCE) / 2)), successes / trials
+    middle = (mean + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z / (1 + z**2 / trials) * math.sqrt(mean * (1 - mean) / trials + z**2 / (4 * trials**2))
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
@@ -167,8 +159,8 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95%, see `scene_interval`."""
-        return scene_interval(self.value, self.scenes)
+        """95%, see `wilson_interval`."""
+        return wilson_interval(float(sum(self.of_scenes)), self.scenes)
 
 
 @dataclass(frozen=True)
@@ -245,10 +237,10 @@ class Summary:
         return mean_and_deviation(self.of_tasks(variant))
 
     def interval_over_tasks(self, variant: Variant) -> tuple[float, float]:
-        """95% interval of the mean of `over_tasks`, see `scene_interval`, with one trial a task and set of
+        """95% interval of the mean of `over_tasks`, see `wilson_interval`, with one trial a task and set of
         demonstrations: scenes that share what was shown are no independent trials."""
         clusters = {(row.scene.task, row.variant.demo_set) for row in self._rows[variant]}
-        return scene_interval(self.over_tasks(variant)[0], len(clusters))
+        return wilson_interval(self.over_tasks(variant)[0] * len(clusters), len(clusters))
 
     def of_sets(self, variant: Variant) -> dict[int, float]:
         """For each set of demonstrations the success rate, averaged over tasks."""

@@ -51,7 +51,7 @@ class CameraCalibration:
     date: str
 
     def save(self, path: Path) -> None:
-        """Write the TOML file that `load` reads."""
+        """Write a TOML file, of which `check_camera` and `read_camera_pose` read a part."""
         facts: dict[str, Any] = {
             "camera": self.camera,
             "date": self.date,
@@ -67,48 +67,24 @@ class CameraCalibration:
             facts["depth_scale"] = round(self.depth_scale, 5)
         save_calibration(path, HEADER, facts, board=asdict(self.board))
 
-    @classmethod
-    def load(cls, path: Path) -> CameraCalibration:
-        """Raises `CellError` that names a missing or wrong key."""
-        section = read_section(path)
-        board = section.section("board")
-        return cls(
-            camera=section.text("camera"),
-            pose=section.array("pose", (4, 4)),
-            intrinsics=section.array("intrinsics", (3, 3)),
-            image_size=tuple(section.array("image_size", (2,)).astype(int).tolist()),
-            method=section.text("method"),
-            reprojection_px=section.number("reprojection_px"),
-            left_out_mm=tuple(section.array("left_out_mm", (None,)).tolist()),
-            touched_mm=tuple(section.array("touched_mm", (None,)).tolist()),
-            depth_scale=section.number("depth_scale") if "depth_scale" in section else None,
-            board=Board(
-                board.whole("columns"),
-                board.whole("rows"),
-                board.number("square_m"),
-                board.number("marker_m"),
-                board.text("dictionary"),
-            ),
-            date=section.text("date"),
-        )
-
 
 def check_camera(file: Path, camera: str, frame: Frame) -> None:
     """Raises `RobotError` where ``frame`` of the device ``camera`` is not of the camera and lens that ``file`` is of.
 
     A file with a pose alone, written by hand, is accepted.
     """
-    if "camera" not in read_section(file):
+    section = read_section(file)
+    if "camera" not in section:
         return
-    known = CameraCalibration.load(file)
-    if camera != known.camera:
-        raise RobotError(f"{known.camera} was calibrated, but {camera} is connected; run rip calibrate camera")
-    expected = known.intrinsics[:2] / np.array(known.image_size)[:, None]
+    if camera != (known := section.text("camera")):
+        raise RobotError(f"{known} was calibrated, but {camera} is connected; run rip calibrate camera")
+    size = section.array("image_size", (2,))
+    expected = section.array("intrinsics", (3, 3))[:2] / size[:, None]
     height, width = frame.depth.shape
     if not np.allclose(frame.intrinsics[:2] / np.array([[width], [height]]), expected, rtol=0.02, atol=0.01):
         raise RobotError(
             f"the intrinsics of {camera} at {width} x {height} are not those of its calibration at "
-            f"{known.image_size[0]} x {known.image_size[1]}: another crop of the image; run rip calibrate camera"
+            f"{size[0]:g} x {size[1]:g}: another crop of the image; run rip calibrate camera"
         )
 
 
