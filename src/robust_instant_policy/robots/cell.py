@@ -120,8 +120,8 @@ class Section:
             raise self.error(key, "must reach above the table, whose z is 0")
         return box
 
-    def section(self, key: str, default: Mapping[str, Any] | None = None) -> Section:
-        value = self._take(key, default)
+    def section(self, key: str) -> Section:
+        value = self._take(key, None)
         if not isinstance(value, Mapping):
             raise self.error(key, f"must be a table, not {value!r}")
         return Section(value, f"{self._where}: {key}")

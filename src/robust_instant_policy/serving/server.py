@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable
-from typing import Any
 
 import uvicorn
 
@@ -19,14 +17,8 @@ PONG_S = 60.0  # after which a silent client counts as gone
 SHUTDOWN_S = 5  # for clients to hang up when the server ends
 
 
-def serve(
-    planner: Planner,
-    listener: socket.socket,
-    key: str | None = None,
-    debug: bool = False,
-    on_server: Callable[[Any], None] | None = None,
-) -> None:
-    """Serve until Ctrl-C, or until ``should_exit`` of the server given to ``on_server`` is set. Raises `UsageError`."""
+def serve(planner: Planner, listener: socket.socket, key: str | None = None, debug: bool = False) -> None:
+    """Serve until Ctrl-C. Raises `UsageError`."""
     host = listener.getsockname()[0]
     config = uvicorn.Config(
         make_app(planner, host, checked_key(host, key), debug),
@@ -40,11 +32,8 @@ def serve(
         timeout_graceful_shutdown=SHUTDOWN_S,
         server_header=False,
     )
-    server = uvicorn.Server(config)
-    if on_server is not None:
-        on_server(server)
     try:
-        server.run(sockets=[listener])
+        uvicorn.Server(config).run(sockets=[listener])
     finally:
         listener.close()
         planner.close()
