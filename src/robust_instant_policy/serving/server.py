@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
+from typing import Any
 
 import uvicorn
 
@@ -17,8 +19,14 @@ PONG_S = 60.0  # after which a silent client counts as gone
 SHUTDOWN_S = 5  # for clients to hang up when the server ends
 
 
-def serve(planner: Planner, listener: socket.socket, key: str | None = None, debug: bool = False) -> None:
-    """Serve until Ctrl-C. Raises `UsageError`."""
+def serve(
+    planner: Planner,
+    listener: socket.socket,
+    key: str | None = None,
+    debug: bool = False,
+    on_server: Callable[[Any], None] | None = None,
+) -> None:
+    """Serve until Ctrl-C, or until ``should_exit`` of the server given to ``on_server`` is set. Raises `UsageError`."""
     host = listener.getsockname()[0]
     config = uvicorn.Config(
         make_app(planner, host, checked_key(host, key), debug),
@@ -32,8 +40,11 @@ def serve(planner: Planner, listener: socket.socket, key: str | None = None, deb
         timeout_graceful_shutdown=SHUTDOWN_S,
         server_header=False,
     )
+    server = uvicorn.Server(config)
+    if on_server is not None:
+        on_server(server)
     try:
-        uvicorn.Server(config).run(sockets=[listener])
+        server.run(sockets=[listener])
     finally:
         listener.close()
         planner.close()
