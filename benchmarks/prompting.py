@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from pick_and_place import TASKS, WITHIN_M, PickAndPlace, Scene, key_error
 
-from robust_instant_policy.context import Frames, Layout, Order, Prompt, write_prompt
+from robust_instant_policy.context import Frames, Layout, Prompt, write_prompt
 from robust_instant_policy.errors import ModelError
 from robust_instant_policy.llm import LanguageModel, Listener, Sampling, connect
 from robust_instant_policy.query import Query
@@ -47,7 +47,6 @@ class Row:
     model: str
     frames: Frames
     layout: Layout
-    order: Order
     temperature: float
 
 
@@ -83,7 +82,7 @@ class Measurement:
         self._row, self._model, self._load_seconds, self._deadline_s = row, model, load_seconds, deadline_s
         self._world = PickAndPlace(row.task)
         demos = [self._world.scene(seed) for seed in range(NUM_DEMOS)]
-        self._prompt = fitted(demos, row.frames, row.layout, row.order)
+        self._prompt = fitted(demos, row.frames, row.layout)
         self._paper = fitted(demos, "world", "sequence", "given")
         self._cold = True
 
@@ -137,9 +136,9 @@ class Measurement:
         return self._model.count_tokens(read) + NUM_SAMPLES * self._model.count_tokens(answer)
 
 
-def fitted(demos: Sequence[Scene], frames: Frames, layout: Layout, order: Order) -> Prompt:
+def fitted(demos: Sequence[Scene], frames: Frames, layout: Layout) -> Prompt:
     keypoints = np.stack([demo.keypoints for demo in demos])
-    return write_prompt(keypoints, [demo.trajectory for demo in demos], frames, layout, order)
+    return write_prompt(keypoints, [demo.trajectory for demo in demos], frames, layout)
 
 
 def agreed_error(candidates: Sequence[Trajectory], scene: Scene, estimator: str, curvature: np.ndarray) -> float:
@@ -234,7 +233,7 @@ def as_cells(row: Row, plans: Sequence[Outcome]) -> list[str]:
 
     return [
         row.task,
-        row.model + (", nearest last" if row.order == "nearest-last" else ""),
+        row.model,
         f"{row.frames}, {row.layout}",
         f"{row.temperature:g}",
         str(len(plans)),
@@ -253,7 +252,7 @@ def as_cells(row: Row, plans: Sequence[Outcome]) -> list[str]:
 def reference_cells(task: str, scenes: int) -> list[str]:
     """The frames without a model: every number is the median of the demonstrations."""
     world = PickAndPlace(task)
-    prompt = fitted([world.scene(seed) for seed in range(NUM_DEMOS)], "adaptive", "factorised", "given")
+    prompt = fitted([world.scene(seed) for seed in range(NUM_DEMOS)], "adaptive", "factorised")
     new = [world.scene(FIRST_NEW_SEED + number, exact=True) for number in range(scenes)]
     errors = [key_error(prompt.median_trajectory(scene.keypoints), scene.trajectory) for scene in new]
     return [task, "none: the median", "adaptive, factorised", "—", str(scenes), "—", "—", _errors(errors), *["—"] * 6]
@@ -301,7 +300,6 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=["place"])
     parser.add_argument("--frames", nargs="+", choices=("world", "adaptive"), default=["world", "adaptive"])
     parser.add_argument("--layouts", nargs="+", choices=("sequence", "factorised"), default=["sequence", "factorised"])
-    parser.add_argument("--orders", nargs="+", choices=("given", "nearest-last"), default=["given"])
     parser.add_argument("--temperatures", nargs="+", type=float, default=[0.7])
     parser.add_argument("--scenes", type=int, default=20)
     parser.add_argument("--sequence-scenes", type=int, default=3, help="sequences take minutes a plan")
@@ -313,11 +311,10 @@ def main() -> None:
         for task in args.tasks:
             for layout in args.layouts:
                 for frames in args.frames:
-                    for order in args.orders:
-                        for temperature in args.temperatures:
-                            row = Row(task, name, frames, layout, order, temperature)
-                            scenes = args.sequence_scenes if layout == "sequence" else args.scenes
-                            measure(row, spec, scenes, args.deadline)
+                    for temperature in args.temperatures:
+                        row = Row(task, name, frames, layout, temperature)
+                        scenes = args.sequence_scenes if layout == "sequence" else args.scenes
+                        measure(row, spec, scenes, args.deadline)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(table())
     print(args.out.read_text())

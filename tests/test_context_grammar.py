@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.context import Prompt, write_prompt
-from robust_instant_policy.context.things import find_things, locate
+from robust_instant_policy.context.discovery import find_things
+from robust_instant_policy.context.things import locate
 from robust_instant_policy.context.ways import find_ranking
 from robust_instant_policy.policies import Neighbours, context_of_keypoints, scene_of_keypoints
 from robust_instant_policy.policies.confidence import UNKNOWN

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robust_instant_policy.context import leave_one_out
+from robust_instant_policy.context import leave_one_out, write_prompt
 from robust_instant_policy.geometry import GripperTriangle, make_pose
 from robust_instant_policy.trajectory import Trajectory
 
@@ -24,12 +24,12 @@ def shown(objects: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, list[Tr
 def test_demonstrations_that_do_the_same_predict_each_other_and_scattered_ones_do_not():
     rng = np.random.default_rng(0)
     objects = np.column_stack([rng.uniform(0.3, 0.6, 10), rng.uniform(-0.2, 0.2, 10), np.full(10, 0.02)])
-    errors = leave_one_out(*shown(objects, np.zeros((10, 3))))
+    errors = leave_one_out(write_prompt(*shown(objects, np.zeros((10, 3)))))
     assert errors.max() < 0.003
-    scattered = leave_one_out(*shown(objects, rng.normal(0, 0.03, (10, 3)) * [1, 1, 0]))
+    scattered = leave_one_out(write_prompt(*shown(objects, rng.normal(0, 0.03, (10, 3)) * [1, 1, 0])))
     assert np.median(scattered.max(axis=1)) > 0.02
 
 
 def test_two_demonstrations_tell_nothing():
     objects = np.array([[0.4, 0.0, 0.02], [0.5, 0.1, 0.02]])
-    assert np.isnan(leave_one_out(*shown(objects, np.zeros((2, 3))))).all()
+    assert np.isnan(leave_one_out(write_prompt(*shown(objects, np.zeros((2, 3)))))).all()

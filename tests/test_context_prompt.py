@@ -9,9 +9,10 @@ import pytest
 
 from robust_instant_policy.context import Prompt, SequencePrompt, write_prompt
 from robust_instant_policy.context.alignment import align
+from robust_instant_policy.context.discovery import find_things
 from robust_instant_policy.context.frames import Anchor, Axes, Frame
 from robust_instant_policy.context.step_frames import StepFrames
-from robust_instant_policy.context.things import WORLD, find_things, locate, robust_fit
+from robust_instant_policy.context.things import WORLD, locate, robust_fit
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import GripperTriangle, make_pose
 from robust_instant_policy.trajectory import Trajectory
@@ -184,12 +185,12 @@ def test_axes_along_a_line_turn_with_it_and_frames_say_how_far_their_origin_move
     origin = (first, second, WORLD), (np.zeros(3),) * 3
     low, high = (np.full(3, 0.1), np.full(3, 0.3)), (np.array([0.3, 0.3, 0.2]), np.full(3, 0.2))
     steps = tuple(Frame(frame.axes, *origin, shares) for shares in (low, low, high))
-    ((words, arm, start, stop, _),) = StepFrames((steps,)).uses(keypoints[0])
-    assert words == (
+    (use,) = StepFrames((steps,)).uses(keypoints[0])
+    assert use.words == (
         "x 10% to 30%, y 10% to 30%, z 10% to 20% of the way from keypoints 0-4 to keypoints 5-9 "
         "and 30% to 20% of the way to the world, axes along the line from keypoints 0-4 to keypoints 5-9 in space"
     )
-    assert (arm, start, stop) == (0, 0, 2)
+    assert (use.arm, use.first, use.last) == (0, 0, 2)
 
 
 def test_the_expected_curvature_is_that_of_the_demonstrations_whatever_their_number():
@@ -317,14 +318,6 @@ def test_only_the_end_of_a_prompt_depends_on_the_scene():
         assert one.text.rsplit("\n", 2)[0] == other.text.rsplit("\n", 2)[0]
 
 
-def test_the_nearest_demonstration_can_be_put_last():
-    keypoints, trajectories = demonstrations()
-    given = write_prompt(keypoints, trajectories, "world", "sequence")
-    sorted_ = write_prompt(keypoints, trajectories, "world", "sequence", order="nearest-last")
-    blocks = given.queries(keypoints[2])[0].text.split("\n\n")
-    assert sorted_.queries(keypoints[2])[0].text.split("\n\n")[-2] == blocks[2]
-
-
 @pytest.mark.parametrize("layout", ["sequence", "factorised"])
 def test_an_answer_that_cannot_be_read_is_refused(layout):
     keypoints, trajectories = demonstrations()
@@ -385,7 +378,7 @@ def test_a_scene_with_another_number_of_keypoints_is_refused():
         prompt.queries(np.zeros((9, 3)))
 
 
-@pytest.mark.parametrize("options", [{"frames": "camera"}, {"layout": "tree"}, {"order": "random"}])
+@pytest.mark.parametrize("options", [{"frames": "camera"}, {"layout": "tree"}])
 def test_an_unknown_option_names_the_known_ones(options):
     with pytest.raises(InvalidValueError, match="must be '"):
         write_prompt(*demonstrations(2), **options)

@@ -9,7 +9,7 @@ import pytest
 
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.level import PAPER
-from robust_instant_policy.tasks.maniskill.block import pose_of
+from robust_instant_policy.tasks.maniskill.camera import matrix
 from robust_instant_policy.tasks.maniskill.sort import PICK, SPEC, TRAY_M, WALL_M
 from robust_instant_policy.tasks.maniskill.task import CellTask
 from robust_instant_policy.tasks.picking import set_down
@@ -21,7 +21,7 @@ def test_the_block_further_away_does_not_belong_into_the_tray():
     def take_the_other(env, rng):
         tray = facing(*TRAY_M, 0.0)
         tray[2, 3] = 2 * WALL_M
-        return [*PICK.strokes(pose_of(env.blocks[1 - env.nearer]), rng), *set_down(tray, PICK)]
+        return [*PICK.strokes(matrix(env.blocks[1 - env.nearer].pose), rng), *set_down(tray, PICK)]
 
     task = CellTask(replace(SPEC, expert=take_the_other), "seen", "code", PAPER)
     try:

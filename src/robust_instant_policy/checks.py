@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import reprlib
 import sys
+from collections.abc import Collection
 from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robust_instant_policy.errors import InvalidValueError
+from robust_instant_policy.errors import InvalidValueError, UnknownNameError
 from robust_instant_policy.geometry import as_numbers
 
 
@@ -28,6 +29,12 @@ def checked_whole(name: str, value: object, least: int = 0) -> int:
     if _is_number(value, Integral) and value >= least:  # type: ignore[operator]
         return int(value)  # type: ignore[call-overload]
     raise InvalidValueError(f"{name} must be a whole number of at least {least}, {_got(value)}")
+
+
+def check_name(kind: str, name: str, known: Collection[str]) -> None:
+    """Raise `UnknownNameError` unless ``name`` is one of the ``known``."""
+    if name not in known:
+        raise UnknownNameError(kind, name, known)
 
 
 def checked_array(name: str, values: ArrayLike, shape: str) -> NDArray[np.float64]:

@@ -39,24 +39,27 @@ def robust_std(values: FloatArray) -> FloatArray:
 
 
 def make_pose(rotation: ArrayLike, position: ArrayLike) -> FloatArray:
-    """Pose ``(4, 4)`` from a rotation matrix ``(3, 3)`` and a position ``(3,)``."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = position
+    """Poses ``(..., 4, 4)`` from rotation matrices ``(..., 3, 3)`` and positions ``(..., 3)``."""
+    pose = np.zeros((*np.shape(rotation)[:-2], 4, 4))
+    pose[..., :3, :3] = rotation
+    pose[..., :3, 3] = position
+    pose[..., 3, 3] = 1.0
     return pose
 
 
 def invert_pose(pose: ArrayLike) -> FloatArray:
-    """Inverse of a rigid pose ``(4, 4)``."""
+    """Inverse of rigid poses ``(..., 4, 4)``."""
     pose = np.asarray(pose, dtype=np.float64)
-    rotation = pose[:3, :3].T
-    return make_pose(rotation, -rotation @ pose[:3, 3])
+    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
+    return make_pose(rotation, (-rotation @ pose[..., :3, 3:])[..., 0])
 
 
 def transform_points(pose: ArrayLike, points: ArrayLike) -> FloatArray:
-    """Map ``points (..., 3)`` of a frame into the world by its ``pose (4, 4)``."""
+    """Map ``points (..., 3)`` of a frame into the world by its ``pose (4, 4)``; or ``(..., N, 3)`` of several frames,
+    each by its ``pose (..., 4, 4)``."""
     pose = np.asarray(pose, dtype=np.float64)
-    return np.asarray(points, dtype=np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    position = pose[:3, 3] if pose.ndim == 2 else pose[..., None, :3, 3]
+    return np.asarray(points, dtype=np.float64) @ np.swapaxes(pose[..., :3, :3], -1, -2) + position
 
 
 def fit_rigid(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> FloatArray:
@@ -78,19 +81,17 @@ def fit_rigid(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
     signs = np.ones(covariance.shape[:-1])
     signs[..., 2] = np.sign(np.linalg.det(left @ right))
     rotation = (left * signs[..., None, :]) @ right
-    pose = np.zeros((*rotation.shape[:-2], 4, 4))
-    pose[..., :3, :3] = rotation
-    pose[..., :3, 3] = target_mean[..., 0, :] - (rotation @ np.swapaxes(source_mean, -1, -2))[..., 0]
-    pose[..., 3, 3] = 1.0
-    return pose
+    return make_pose(rotation, target_mean[..., 0, :] - (rotation @ np.swapaxes(source_mean, -1, -2))[..., 0])
 
 
 def rotations_about_vertical(angles: ArrayLike) -> FloatArray:
     """Rotations ``(..., 3, 3)`` by ``angles (...)`` radians about the world's z axis."""
-    cos, sin = np.cos(angles), np.sin(angles)
-    zero = np.zeros_like(cos)
-    rows = [cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1]
-    return np.stack(rows, axis=-1).reshape(*np.shape(angles), 3, 3)
+    rotation = np.zeros((*np.shape(angles), 3, 3))
+    rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(angles)
+    rotation[..., 1, 0] = np.sin(angles)
+    rotation[..., 0, 1] = -rotation[..., 1, 0]
+    rotation[..., 2, 2] = 1.0
+    return rotation
 
 
 def fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
@@ -106,11 +107,12 @@ def fit_upright(source: FloatArray, target: FloatArray, weights: FloatArray) -> 
     products = weighted @ target - source_mean[..., :, None] * target_mean[..., None, :]
     sine = products[..., 0, 1] - products[..., 1, 0]
     rotation = rotations_about_vertical(np.arctan2(sine, products[..., 0, 0] + products[..., 1, 1]))
-    motion = np.zeros((*rotation.shape[:-2], 4, 4))
-    motion[..., :3, :3] = rotation
-    motion[..., :3, 3] = target_mean - (rotation @ source_mean[..., None])[..., 0]
-    motion[..., 3, 3] = 1.0
-    return motion
+    return make_pose(rotation, target_mean - (rotation @ source_mean[..., None])[..., 0])
+
+
+def interpolate(at: np.ndarray, times: np.ndarray, values: FloatArray) -> FloatArray:
+    """``values (T, D)`` at increasing ``times (T,)``, linearly interpolated at ``at (M,)``: ``(M, D)``."""
+    return np.stack([np.interp(at, times, column) for column in values.T], axis=1)
 
 
 def project(points: ArrayLike, intrinsics: ArrayLike, camera_pose: ArrayLike) -> FloatArray:
@@ -166,8 +168,7 @@ class GripperTriangle:
 
     def triplets(self, poses: ArrayLike) -> FloatArray:
         """World triplets ``(..., 3, 3)`` of tool ``poses (..., 4, 4)``."""
-        poses = np.asarray(poses, dtype=np.float64)
-        return self.points @ np.swapaxes(poses[..., :3, :3], -1, -2) + poses[..., None, :3, 3]
+        return transform_points(poses, self.points)
 
     def poses(self, triplets: ArrayLike) -> FloatArray:
         """Tool poses ``(..., 4, 4)`` whose rigid triangle fits ``triplets (..., 3, 3)`` best."""

@@ -11,7 +11,7 @@ MILLIMETRES_ABOVE = 20.0  # a median depth beyond 20 "metres" is millimetres: ar
 SURFACE_TOLERANCE = 0.015  # share of the depth within which neighbouring readings are one surface
 STEADY_NEIGHBOURS = 3
 
-ON_TABLE_M = 0.006  # points this near to a plane speak for it
+ON_TABLE_M = 0.006  # points this near to a plane count for it
 SAMPLED_POINTS = 1500
 SAMPLED_PLANES = 200
 MAX_LEVELS = 3  # horizontal planes that are compared with the largest one

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robust_instant_policy.errors import InvalidValueError
-from robust_instant_policy.geometry import FloatArray, GripperTriangle, as_numbers
+from robust_instant_policy.geometry import FloatArray, GripperTriangle, as_numbers, interpolate
 
 ACTION_DIM = 10  # gripper point xyz, two fingertips xyz, gripper state
 STATE_INDEX = 9
@@ -103,7 +103,7 @@ class Trajectory:
     def resampled(self, times: ArrayLike) -> Trajectory:
         """The trajectory at other ``times (M,)``: points linear in time, gripper state held until it changes."""
         times = np.asarray(times, dtype=np.float64)
-        actions = np.stack([np.interp(times, self.times, column) for column in self.actions.T], axis=1)
+        actions = interpolate(times, self.times, self.actions)
         held = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self) - 1)
         actions[:, STATE_INDEX::ACTION_DIM] = self.gripper_state[held]
         return Trajectory(actions, times)

@@ -3,7 +3,7 @@
 from robust_instant_policy.context.factorised import FactorisedPrompt
 from robust_instant_policy.context.frames import Frame
 from robust_instant_policy.context.leave_one_out import leave_one_out
-from robust_instant_policy.context.prompt import Frames, Layout, Order, Prompt
+from robust_instant_policy.context.prompt import Frames, Layout, Prompt
 from robust_instant_policy.context.sequence import SequencePrompt
 from robust_instant_policy.context.writing import write_prompt
 
@@ -12,7 +12,6 @@ __all__ = [
     "Frame",
     "Frames",
     "Layout",
-    "Order",
     "Prompt",
     "SequencePrompt",
     "leave_one_out",

@@ -14,8 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from robust_instant_policy.context.choice import NOISE_M
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.context.candidates import NOISE_M
+from robust_instant_policy.geometry import FloatArray, interpolate
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 CURVATURE_MARGIN = 2.0  # a new scene may need this many times the curvature that was shown
@@ -122,9 +122,9 @@ def _tips(actions: FloatArray) -> FloatArray:
 
 
 def _typical(paths: FloatArray) -> FloatArray:
-    """What is usual of ``paths (I, n, D)``, metres, for the ends of each: ``(I, n, D)``.
+    """The path ``(I, n, D)`` that is expected between the two ends of each of ``paths (I, n, D)``, metres.
 
-    At each step a constant distance from the first point, and a share of the way to the last one.
+    At each step a constant distance from the first point and a share of the way to the last one, the same in all.
     """
     first = paths[:, :1]
     way = paths[:, -1:] - first
@@ -153,15 +153,15 @@ def _warped_times(paths: FloatArray, others: FloatArray) -> FloatArray:
 def _matched(total: FloatArray) -> FloatArray:
     """For each of n steps the mean ``(n,)`` of those that are matched with it, from the costs ``(n + 1, m + 1)``."""
     i, j = total.shape[0] - 1, total.shape[1] - 1
+    cost = total.tolist()  # lists are read several times as fast as single elements of an array
     matched: list[list[int]] = [[] for _ in range(i)]
     while i and j:
         matched[i - 1].append(j - 1)
-        before = (total[i - 1, j - 1], total[i - 1, j] + WAITING_M, total[i, j - 1] + WAITING_M)
-        i, j = ((i - 1, j - 1), (i - 1, j), (i, j - 1))[int(np.argmin(before))]
-    return np.array([float(np.mean(own)) for own in matched])
+        before = (cost[i - 1][j - 1], cost[i - 1][j] + WAITING_M, cost[i][j - 1] + WAITING_M)
+        i, j = ((i - 1, j - 1), (i - 1, j), (i, j - 1))[before.index(min(before))]
+    return np.array([sum(own) / len(own) for own in matched])
 
 
 def _at(actions: FloatArray, times: FloatArray) -> FloatArray:
     """``actions (n, D)`` between their steps, at ``times (m,)``."""
-    steps = np.arange(len(actions))
-    return np.stack([np.interp(times, steps, column) for column in actions.T], axis=1)
+    return interpolate(times, np.arange(len(actions)), actions)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.context.choice import NOISE_M
+from robust_instant_policy.context.candidates import NOISE_M
 from robust_instant_policy.context.codec import MM, read_rows, row_grammar, row_pattern, write_row
-from robust_instant_policy.context.frames import Frame
+from robust_instant_policy.context.frames import Frame, runs
 from robust_instant_policy.context.prompt import INSTRUCTION, REACH_MM, Prompt
 from robust_instant_policy.context.step_frames import StepFrames
 from robust_instant_policy.context.ways import Split
@@ -65,23 +64,21 @@ class FactorisedPrompt(Prompt):
     def ways(self) -> tuple[FactorisedPrompt, ...]:
         return self.parts or (self,)
 
-    def way(self, keypoints: FloatArray) -> int:
-        return 0 if self.split is None else self.split.decide(self.frames.named(self.checked(keypoints)))[0]
+    def decide(self, keypoints: FloatArray) -> tuple[int, float]:
+        if self.split is None:
+            return super().decide(keypoints)
+        return self.split.decide(self.frames.named(self.checked(keypoints)[None])[0])
 
     def notes(self) -> tuple[str, ...]:
         split = () if self.split is None else (str(self.split),)
         return (*split, *super().notes())
 
-    def vote(self, keypoints: FloatArray) -> float:
-        return 1.0 if self.split is None else self.split.decide(self.frames.named(self.checked(keypoints)))[1]
-
     def queries(self, keypoints: FloatArray) -> list[Query]:
-        keypoints = self.checked(keypoints)
-        inputs = self.frames.inputs(keypoints)
+        keypoints = self.checked(keypoints)[None]
+        (inputs,) = self.frames.inputs(self.frames.poses(keypoints), keypoints)
         return [
             Query(
-                self.ordered(question.examples, keypoints)
-                + _input(inputs[question.step, question.arm], question.inputs),
+                "".join(question.examples) + _input(inputs[question.step, question.arm], question.inputs),
                 max_tokens=sum(question.digits) + 2 * len(question.digits) + 1,
                 grammar=row_grammar(question.digits),
                 pattern=row_pattern(question.digits),
@@ -126,8 +123,9 @@ class FactorisedPrompt(Prompt):
     def carried_over(self, keypoints: FloatArray, count: int) -> tuple[Trajectory, ...]:
         """The ``count`` demonstrations nearest to the scene of ``keypoints (K, 3)``, nearest first, each transferred to
         it: its numbers stay the same in each step's frame, and the frames move with the keypoints."""
-        keypoints = self.checked(keypoints)
-        nearest = self.by_distance(keypoints)[::-1][:count]
+        new = self.frames.named(self.checked(keypoints)[None])
+        distances = np.linalg.norm(self.frames.named(self.keypoints) - new, axis=-1).mean(axis=-1)
+        nearest = np.argsort(distances, kind="stable")[:count]
         return tuple(self._decoded(keypoints, self.numbers[demo]) for demo in nearest)
 
 
@@ -160,14 +158,14 @@ def from_turns(hands: FloatArray, reference: FloatArray) -> FloatArray:
 
 
 def make_questions(
-    frames: StepFrames, keypoints: FloatArray, numbers: FloatArray, median: FloatArray, key_steps: Sequence[int]
+    frames: StepFrames, inputs: FloatArray, offsets: FloatArray, key_steps: Sequence[int]
 ) -> tuple[Question, ...]:
-    """What to ask of demonstrations with ``keypoints (I, K, 3)`` and ``numbers (I, T, 7·A)`` in ``frames``."""
-    shown = np.stack([frames.inputs(points) for points in keypoints])
+    """What to ask of demonstrations with keypoints ``inputs (I, T, A, 3·K)`` and ``offsets (I, T, 7·A)`` from their
+    median in ``frames``."""
     questions = (
-        _question(arm, steps, numbers - median, shown)
+        _question(arm, steps, offsets, inputs)
         for arm, own in enumerate(frames.arms)
-        for steps in _blocks(own, key_steps, (numbers - median)[..., HAND_DIM * arm : HAND_DIM * (arm + 1)])
+        for steps in _blocks(own, key_steps, offsets[..., HAND_DIM * arm : HAND_DIM * (arm + 1)])
     )
     return tuple(question for question in questions if question is not None)
 
@@ -178,9 +176,8 @@ def _blocks(frames: Sequence[Frame], key_steps: Sequence[int], offsets: FloatArr
     Of each run of frames that continue each other, the key steps, and as many others as give the demonstrations'
     ``offsets (I, T, 7)`` by interpolation.
     """
-    changes = [step for step in range(1, len(frames)) if not frames[step].continues(frames[step - 1])]
     blocks = []
-    for start, stop in pairwise([0, *changes, len(frames)]):
+    for start, stop in runs(frames):
         asked = sorted({start, stop - 1, *(key for key in key_steps if start <= key < stop)})
         while True:
             if len(asked) == stop - start:

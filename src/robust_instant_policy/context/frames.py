@@ -15,12 +15,14 @@ where a thing is the world, a keypoint, or keypoints that move together (`things
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
 from robust_instant_policy.context.things import WORLD, Scene, Thing, locate
-from robust_instant_policy.geometry import FloatArray, rotations_about_vertical
+from robust_instant_policy.geometry import FloatArray, make_pose, rotations_about_vertical
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +124,7 @@ class Frame:
             origin = origin + (along @ np.swapaxes(rotation, 1, 2))[:, 0]
         for thing, offset in self.growth:
             origin = origin + (scene[thing].size - 1)[:, None] * (rotation @ offset)
-        pose = np.tile(np.eye(4), (len(origin), 1, 1))
-        pose[:, :3, :3], pose[:, :3, 3] = rotation, origin
-        return pose
+        return make_pose(rotation, origin)
 
     def pose(self, keypoints: FloatArray) -> FloatArray:
         """The frame's pose ``(4, 4)`` in the scene of ``keypoints (K, 3)``."""
@@ -136,6 +136,24 @@ class Frame:
 
 
 WORLD_FRAME = Frame(Axes((Anchor(WORLD, np.zeros(3)),)), (WORLD,), (np.zeros(3),))
+
+
+@dataclass(frozen=True, eq=False)
+class FrameUse:
+    """A frame in which the steps ``first`` to ``last`` of an arm were planned, in ``words``, and the last step's pose
+    ``(4, 4)``."""
+
+    words: str
+    arm: int
+    first: int
+    last: int
+    pose: FloatArray
+
+
+def runs(frames: Sequence[Frame]) -> list[tuple[int, int]]:
+    """Runs of steps whose ``frames`` continue each other: the first step, and the one after the last."""
+    changes = [step for step in range(1, len(frames)) if not frames[step].continues(frames[step - 1])]
+    return list(pairwise([0, *changes, len(frames)]))
 
 
 def _percent(low: FloatArray, high: FloatArray) -> str:

@@ -1,8 +1,8 @@
 """Smooth joins where the frame of a trajectory changes.
 
 Two frames predict neighbouring steps independently: between them the gripper may jump or turn on the spot by far more
-than any demonstration does. Steps on the way are predicted with larger errors than those at things, and give way: the
-corrections d_t of the steps, points and turns alike, minimise
+than any demonstration does. A smooth motion needs corrections d_t, of points and turns alike. Steps between things are
+predicted with larger errors than those at things and are corrected more: the corrections minimise
 
     Σ_t |d_t|² / e_t² + Σ_t |d_{t+1} - d_t + j_t|² / `STEP_M`²
 
@@ -16,12 +16,11 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.context.choice import NOISE_M
-from robust_instant_policy.geometry import FloatArray, fit_rigid
+from robust_instant_policy.context.candidates import NOISE_M
+from robust_instant_policy.geometry import FloatArray, fit_rigid, interpolate
 
 STEP_M = 0.01  # by how much a corrected step may differ from a predicted one
 KEY_SHARE = 0.01  # of the error of key steps
@@ -43,7 +42,7 @@ def joined(
     before = np.array(sorted(changes), dtype=int) - 1
     usual = np.setdiff1d(np.arange(len(motions)), before)
     if len(usual):
-        jumps[before] = motions[before] - _interpolated(motions, usual, before)
+        jumps[before] = motions[before] - interpolate(before, usual, motions[usual])
     for part, allowed in zip((slice(0, 3), slice(3, 6)), demonstrated.T, strict=True):
         size = np.linalg.norm(jumps[:, part], axis=1)
         jumps[:, part] *= np.maximum(1 - allowed / np.maximum(size, 1e-9), 0.0)[:, None]
@@ -76,11 +75,6 @@ def hand_motions(hands: FloatArray) -> FloatArray:
     shape = hands - centre[:, None]
     turns = Rotation.from_matrix(fit_rigid(shape[:-1], shape[1:])[:, :3, :3]).as_rotvec()
     return np.concatenate([np.diff(centre, axis=0), turns], axis=1)
-
-
-def _interpolated(motions: FloatArray, usual: NDArray[np.intp], at: NDArray[np.intp]) -> FloatArray:
-    """``(len(at), D)``: the ``motions (T, D)`` of the steps ``usual``, interpolated to the steps ``at``."""
-    return np.stack([np.interp(at, usual, column) for column in motions[usual].T], axis=1)
 
 
 def _unlike_neighbours(motions: FloatArray) -> FloatArray:

@@ -6,36 +6,32 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from robust_instant_policy.context.alignment import align
 from robust_instant_policy.context.codec import MM
 from robust_instant_policy.context.factorised import FactorisedPrompt, informative_inputs
 from robust_instant_policy.context.prompt import Prompt
-from robust_instant_policy.context.writing import write_prompt
+from robust_instant_policy.context.writing import adaptive_prompt
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
+from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
 MIN_DEMOS = 3  # with fewer, nothing is left to learn from
 RIDGE_MM = 20.0  # standard deviation of an input below which it explains little
 
 
-def leave_one_out(
-    keypoints: FloatArray, trajectories: Sequence[Trajectory], prompt: Prompt | None = None
-) -> FloatArray:
+def leave_one_out(prompt: Prompt) -> FloatArray:
     """Error ``(I, S)``, metres, with which each demonstration is predicted from the others, at S key steps.
 
     Predicted are the gripper point and the fingertips of each arm in the frames of the steps, from the demonstrations
     that go the same way, by ridge regression on the keypoint coordinates that a language model would be shown; the
-    error is that of the worst point. Frames and ways are those of ``prompt``, by default of the adaptive one. Key steps
-    are the first and the last one and both sides of every gripper change. ``keypoints (I, K, 3)`` in metres. NaN with
-    fewer than `MIN_DEMOS` demonstrations that use the gripper alike.
+    error is that of the worst point. Frames and ways are those of the adaptive, factorised prompt. Key steps are the
+    first and the last one and both sides of every gripper change. NaN with fewer than `MIN_DEMOS` demonstrations that
+    use the gripper alike.
     """
-    aligned = align(trajectories)
+    aligned = prompt.aligned
     errors = np.zeros((len(aligned.kept), len(aligned.key_steps)))
     if len(errors) < MIN_DEMOS:
         return np.full_like(errors, np.nan)
     if not isinstance(prompt, FactorisedPrompt) or prompt.variation is None:
-        prompt = write_prompt(keypoints, trajectories)
-    assert isinstance(prompt, FactorisedPrompt)
+        prompt = adaptive_prompt(prompt.keypoints[[prompt.shown.index(demo) for demo in aligned.kept]], aligned)
     for way in prompt.ways:
         rows = [aligned.kept.index(demo) for demo in way.shown]
         errors[rows] = _errors(way, aligned.actions[rows], aligned.key_steps)
@@ -44,9 +40,8 @@ def leave_one_out(
 
 def _errors(way: FactorisedPrompt, actions: FloatArray, key_steps: Sequence[int]) -> FloatArray:
     errors = np.zeros((len(actions), len(key_steps)))
-    pairs = zip(way.keypoints, actions, strict=True)
-    numbers = np.stack([way.frames.encode(points, own) for points, own in pairs])
-    shown = np.stack([way.frames.inputs(points) for points in way.keypoints])  # (I, T, A, 3·K)
+    poses = way.frames.poses(way.keypoints)
+    numbers, shown = way.frames.encode(poses, actions), way.frames.inputs(poses, way.keypoints)
     for column, step in enumerate(key_steps):
         for arm in range(way.frames.num_arms):
             outputs = numbers[:, step, ACTION_DIM * arm : ACTION_DIM * arm + STATE_INDEX]

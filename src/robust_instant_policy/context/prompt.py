@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
+from robust_instant_policy.checks import checked_array
+from robust_instant_policy.context.alignment import AlignedDemonstrations
 from robust_instant_policy.context.step_frames import StepFrames
 from robust_instant_policy.context.things import DEMOS_TO_TELL_THINGS, WORLD
-from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.query import Query
 from robust_instant_policy.trajectory import Trajectory
@@ -39,45 +38,42 @@ GUESS_NOTE = (
 
 Layout = Literal["sequence", "factorised"]
 Frames = Literal["world", "adaptive"]
-Order = Literal["given", "nearest-last"]
 
 
 @dataclass(frozen=True, eq=False)
 class Prompt(ABC):
     """Serialised demonstrations; made by `write_prompt`.
 
-    ``keypoints (I, K, 3)``, metres, are those of the demonstrations ``shown`` (indices), ``frames`` the frame of each
-    step. Evenly spread over a trajectory, ``curvature (B,)``, metres, bound how sharply the gripper is expected to
-    turn (see `AlignedDemonstrations.curvature`), and ``variation (T,)``, metres, is the demonstrations'
-    standard deviation in these frames; None in the world frame, where scenes vary too, and of one demonstration.
-
-    With ``order`` "nearest-last" the demonstrations whose keypoints are nearest to the new scene's stand last. A server
-    can then not reuse its prefix cache from scene to scene, as it can with "given".
+    ``keypoints (I, K, 3)``, metres, are those of the demonstrations ``shown`` (indices), ``aligned`` are all of them,
+    ``frames`` the frame of each step. ``variation (T,)``, metres, evenly spread over a trajectory, is the
+    demonstrations' standard deviation in these frames; None in the world frame, where scenes vary too, and of one
+    demonstration.
     """
 
     keypoints: FloatArray
+    aligned: AlignedDemonstrations
     frames: StepFrames
-    curvature: FloatArray
     variation: FloatArray | None
-    order: Order
     shown: tuple[int, ...]
+
+    @property
+    def curvature(self) -> FloatArray:
+        """How sharply the gripper is expected to turn ``(B,)``, metres, see `AlignedDemonstrations.curvature`."""
+        return self.aligned.curvature()
 
     @property
     def ways(self) -> tuple[Prompt, ...]:
         """One prompt for each way to act that the demonstrations show; itself where all do the same."""
         return (self,)
 
-    def way(self, keypoints: FloatArray) -> int:
-        """Which of ``ways`` applies in the scene of ``keypoints (K, 3)``."""
-        return 0
+    def decide(self, keypoints: FloatArray) -> tuple[int, float]:
+        """Which of ``ways`` applies in the scene of ``keypoints (K, 3)``, and how clearly: 1 is as in the
+        demonstrations, 0 a tie."""
+        return 0, 1.0
 
     def for_scene(self, keypoints: FloatArray) -> Prompt:
         """The prompt of the way that applies in the scene of ``keypoints (K, 3)``."""
-        return self.ways[self.way(keypoints)]
-
-    def vote(self, keypoints: FloatArray) -> float:
-        """How clearly one way applies in the scene of ``keypoints (K, 3)``: 1 is as in the demonstrations, 0 a tie."""
-        return 1.0
+        return self.ways[self.decide(keypoints)[0]]
 
     def outside(self, keypoints: FloatArray) -> float:
         """How far the scene of ``keypoints (K, 3)`` lies outside of the demonstrations in what the frames depend on; 0
@@ -92,7 +88,8 @@ class Prompt(ABC):
 
     def scene_notes(self, keypoints: FloatArray) -> tuple[str, ...]:
         """The same about the scene of ``keypoints (K, 3)``."""
-        vote, outside = self.vote(keypoints), self.for_scene(keypoints).outside(keypoints)
+        (way, vote) = self.decide(keypoints)
+        outside = self.ways[way].outside(keypoints)
         close = () if vote >= CLOSE_VOTE else (CLOSE_NOTE.format(vote),)
         return (*close, *((OUTSIDE_NOTE.format(outside),) if outside > FAR_OUTSIDE else ()))
 
@@ -108,22 +105,6 @@ class Prompt(ABC):
     def trajectory(self, answers: Sequence[FloatArray], keypoints: FloatArray) -> Trajectory:
         """The trajectory of one answer to each query, as `read`, in the scene of ``keypoints (K, 3)``."""
 
-    def by_distance(self, keypoints: FloatArray) -> list[int]:
-        """Indices of the demonstrations by their keypoints' mean distance from ``keypoints (K, 3)``, furthest first."""
-        named = np.stack([self.frames.named(points) for points in self.keypoints])
-        distances = np.linalg.norm(named - self.frames.named(keypoints), axis=-1).mean(axis=-1)
-        return sorted(range(len(distances)), key=lambda demo: -distances[demo])
-
-    def ordered(self, examples: Sequence[str], keypoints: FloatArray) -> str:
-        """``examples``, one a demonstration, in the order in which they are shown for a scene."""
-        if self.order == "nearest-last":
-            examples = [examples[demo] for demo in self.by_distance(keypoints)]
-        return "".join(examples)
-
     def checked(self, keypoints: FloatArray) -> FloatArray:
         """``keypoints`` as an array; raises `InvalidValueError` unless they are ``(K, 3)`` and finite."""
-        keypoints = np.asarray(keypoints, dtype=np.float64)
-        expected = self.keypoints.shape[1:]
-        if keypoints.shape != expected or not np.isfinite(keypoints).all():
-            raise InvalidValueError(f"keypoints must be {expected} and finite, got {keypoints.shape}")
-        return keypoints
+        return checked_array("keypoints", keypoints, str(self.keypoints.shape[1:]))

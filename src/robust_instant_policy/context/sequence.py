@@ -28,13 +28,18 @@ class SequencePrompt(Prompt):
     lengths: tuple[int, int]
     raw: bool
 
+    @property
+    def curvature(self) -> FloatArray:
+        curvature = super().curvature
+        return np.full_like(curvature, curvature.max()) if self.raw else curvature  # raw steps are not aligned
+
     def queries(self, keypoints: FloatArray) -> list[Query]:
         keypoints = self.checked(keypoints)
         columns = ACTION_DIM * self.frames.num_arms
         form = (*self.lengths, columns, range(STATE_INDEX, columns, ACTION_DIM))
         return [
             Query(
-                self.ordered(self.examples, keypoints) + _input(keypoints),
+                "".join(self.examples) + _input(keypoints),
                 max_tokens=self.lengths[1] * columns * TOKENS_PER_NUMBER,
                 grammar=rows_grammar(*form),
                 pattern=rows_pattern(*form),

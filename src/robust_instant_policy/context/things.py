@@ -1,4 +1,4 @@
-"""Things: keypoints that move together, found from how their distances vary over the demonstrations."""
+"""Things: keypoints that move together, and where they are in a scene. `discovery` finds them."""
 
 from __future__ import annotations
 
@@ -8,29 +8,17 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from scipy.cluster.hierarchy import fcluster, linkage, to_tree
-from scipy.optimize import least_squares
-from scipy.spatial.distance import squareform
-from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.geometry import FloatArray, fit_rigid, fit_upright, robust_std, rotations_about_vertical
+from robust_instant_policy.geometry import (
+    FloatArray,
+    fit_rigid,
+    fit_upright,
+    rotations_about_vertical,
+    transform_points,
+)
 
-RIGID_SPREADS = 3.5  # keypoints whose distance varies by so many times the smallest variation belong to the same thing,
-RIGID_SPREAD_M = (0.006, 0.015)  # within these limits
 DEMOS_TO_TELL_THINGS = 3  # with fewer, all distances look constant
-DEMOS_FOR_MEDIANS = 5  # with fewer, an outlier cannot be identified
 OUTLIER_M = 0.006  # residual at which a keypoint's influence on a fitted pose is halved
-SHAPE_TOLERANCE = 0.15  # of a thing's size: how far its shape may vary beside its size
-LEAST_SWING_RAD = 0.2  # a part that turns less than this shows no hinge
-LEVEL_RAD = 0.2  # usual tilt of a hinge's axis from the horizontal or the vertical; short arcs show the axis badly
-HINGE_SHARES = (1.0, 0.25, 0.5, 0.75)  # of a part's angle at which frames about its hinge stand
-FLAT_CIRCLE = 0.01  # singular values below this share of the largest: arcs too short to show their centre
-HINGE_PRIOR = 0.01  # weight of the first guess: turning about an axis and moving along it change nothing else
-LEAST_SCALED = 4  # keypoints of a thing of varying size: two define it
-LEAST_GROWTH = 0.1  # standard deviation of a thing's size, relative; one that varies less shows no size
-SIZE_EXPLAINS = 0.7  # relative spread of distances when divided by the size, below which a thing has one
-MAX_THINGS = 4  # of several keypoints: those of the most keypoints
-MIRRORED_DEMOS = 2  # in which a thing has the other hand: a single one may be an error
 MIRROR = np.array([1.0, -1.0, 1.0])
 
 Kind = Literal["world", "point", "upright", "rigid", "scaled", "hinged"]
@@ -131,177 +119,16 @@ def _located(thing: Thing, keypoints: FloatArray, found: Scene) -> Located:
         hinge, base = thing.hinge, found[thing.hinge.base]
         axis = base.rotation @ hinge.rotation
         origin = base.point(hinge.point)
-        turned = _complex((points - origin[:, None]) @ axis)
-        angle = np.angle((np.conj(_complex(thing.shape)) * turned).sum(axis=1))
+        turned = as_complex((points - origin[:, None]) @ axis)
+        angle = np.angle((np.conj(as_complex(thing.shape)) * turned).sum(axis=1))
         return Located(axis @ rotations_about_vertical(hinge.share * angle), origin, unit, unit)
     if thing.kind == "scaled":
         middle = points.mean(axis=1)
-        ratio = (np.conj(_complex(thing.shape)) * _complex(points - middle[:, None])).sum(axis=1)
-        ratio = ratio / (np.abs(_complex(thing.shape)) ** 2).sum()
+        ratio = (np.conj(as_complex(thing.shape)) * as_complex(points - middle[:, None])).sum(axis=1)
+        ratio = ratio / (np.abs(as_complex(thing.shape)) ** 2).sum()
         return Located(rotations_about_vertical(np.angle(ratio)), middle, np.abs(ratio), unit)
-    poses, hand, _ = _fit_either_hand(thing.shape, points, thing.kind == "upright", thing.mirrors)
-    return Located(poses[:, :3, :3], poses[:, :3, 3], _rms_radius(points, 3) / _rms_radius(thing.shape[None], 3), hand)
-
-
-def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
-    """What demonstrations with ``keypoints (I, K, 3)`` consist of: things of several keypoints, then loose points.
-
-    Keypoints belong together when their distances are nearly the same in all demonstrations, or keep their ratios. With
-    too few demonstrations to tell, every group of neighbours may be a thing. ``hinges`` are looked for on demand.
-    """
-    num_demos, num_points = keypoints.shape[:2]
-    if num_points == 1:
-        return [Thing("point", (0,))]
-    distances = np.linalg.norm(keypoints[:, :, None] - keypoints[:, None], axis=-1)
-    if num_demos < DEMOS_TO_TELL_THINGS:
-        tree = linkage(squareform(np.median(distances, axis=0), checks=False), "average")
-        nodes = to_tree(tree, rd=True)[1]
-        groups = [tuple(sorted(node.pre_order())) for node in nodes if not node.is_leaf()]
-        return [*_solid(groups, keypoints, RIGID_SPREAD_M[1]), *(Thing("point", (k,)) for k in range(num_points))]
-    varies = spread(distances)
-    least = np.median(np.where(np.eye(num_points, dtype=bool), np.inf, varies).min(axis=1))
-    tolerance = float(np.clip(RIGID_SPREADS * least, *RIGID_SPREAD_M))
-    clusters = _clusters(varies, tolerance)
-    scaled = [thing for thing in _scaled(keypoints, tolerance) if _outnumbers(thing.members, clusters)]
-    taken = {member for thing in scaled for member in thing.members}
-    groups = [group for group in clusters if len(group) > 1 and taken.isdisjoint(group)]
-    things = _solid(sorted(groups, key=lambda group: -len(group))[:MAX_THINGS], keypoints, tolerance) + scaled
-    if hinges:
-        things += _hinged(things, keypoints, tolerance)
-    known = {member for thing in things if thing.kind != "scaled" for member in thing.members}
-    return things + [Thing("point", (k,)) for k in range(num_points) if k not in known]
-
-
-def _clusters(varies: FloatArray, tolerance: float) -> list[tuple[int, ...]]:
-    """Groups of keypoints all of whose distances vary less than ``tolerance``."""
-    labels = fcluster(linkage(squareform(varies, checks=False), "complete"), tolerance, "distance")
-    return [tuple(map(int, np.flatnonzero(labels == label))) for label in np.unique(labels)]
-
-
-def _outnumbers(members: tuple[int, ...], clusters: Sequence[tuple[int, ...]]) -> bool:
-    """Whether more keypoints keep their shape than their distances: those that keep their distances are among them, or
-    at most half as many, as neighbours on a thing that hardly grows between them."""
-    touching = [set(cluster) for cluster in clusters if not set(cluster).isdisjoint(members)]
-    return all(own < set(members) or 2 * len(own) <= len(members) for own in touching)
-
-
-def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray, tolerance: float) -> list[Thing]:
-    things = []
-    kinds: tuple[tuple[Kind, int], ...] = (("upright", 2), ("rigid", 3))
-    for kind, size in kinds:
-        for group in groups:
-            if len(group) >= size:
-                shape, mirrors = _mean_shape(keypoints[:, list(group)], kind == "upright", tolerance)
-                things.append(Thing(kind, group, shape, mirrors=mirrors))
-    return things
-
-
-def _scaled(keypoints: FloatArray, tolerance: float) -> list[Thing]:
-    """Things that keep their shape, seen from above, but not their size.
-
-    Two keypoints define a position, a turn and a size; others belong to them where these predict where they are.
-    """
-    things: list[Thing] = []
-    loose = list(range(keypoints.shape[1]))
-    while len(loose) >= LEAST_SCALED:
-        z = _complex(keypoints[:, loose])
-        apart = z[:, None, :] - z[:, :, None]  # from j to k
-        length = np.abs(apart).mean(axis=0)
-        coincide = apart == 0  # k is j, or both were found in one place
-        relative = (z[:, None, None, :] - z[:, :, None, None]) / np.where(coincide, 1.0, apart)[..., None]
-        scatter = np.hypot(spread(relative.real), spread(relative.imag)) * length[..., None]  # (j, k, member)
-        near = np.minimum(length[:, None], length[None])  # of a member to j or k
-        fits = scatter < np.maximum(SHAPE_TOLERANCE * near, tolerance)
-        fits[coincide.any(axis=0)] = False
-        count = fits.sum(axis=-1) - (scatter * fits).sum(axis=-1)
-        j, k = np.unravel_index(int(np.argmax(count)), count.shape)
-        members = tuple(loose[index] for index in np.flatnonzero(fits[j, k]))
-        if len(members) < LEAST_SCALED:
-            break
-        loose = [k for k in loose if k not in members]
-        points = keypoints[:, list(members)]
-        size = _rms_radius(points)
-        distances = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
-        relative = distances * (size.mean() / size)[:, None, None]
-        explained = spread(relative).sum() < SIZE_EXPLAINS * spread(distances).sum()
-        if explained and size.std() > LEAST_GROWTH * size.mean():
-            unit = points * (size.mean() / size)[:, None, None]
-            things.append(Thing("scaled", members, _mean_shape(unit, True, np.inf)[0]))
-    return things
-
-
-def _rms_radius(points: FloatArray, dimensions: int = 2) -> FloatArray:
-    """Of ``points (I, N, 3)``, seen from above or in space: ``(I,)``, metres."""
-    seen = points[..., :dimensions] - points[..., :dimensions].mean(axis=1, keepdims=True)
-    return np.sqrt((seen**2).sum(axis=-1).mean(axis=-1))
-
-
-def _hinged(things: Sequence[Thing], keypoints: FloatArray, tolerance: float) -> list[Thing]:
-    """Rigid things that turn about an axis fixed in another one or in the world, at shares of their angle."""
-    rigid = [thing.members for thing in things if thing.kind == "rigid"]
-    bases = [WORLD, *(thing for thing in things if thing.kind in ("upright", "rigid"))]
-    found = locate(bases, keypoints)
-    hinged: list[Thing] = []
-    for members in rigid:
-        points = keypoints[:, list(members)]
-        found_axes = [_hinge(base, found[base], points) for base in bases if base.members != members]
-        fits = [fit for fit in found_axes if fit is not None and fit[0] < tolerance]
-        if fits:
-            _, hinge, shape = min(fits, key=lambda fit: fit[0])
-            for share in HINGE_SHARES:
-                hinged.append(Thing("hinged", members, shape, Hinge(hinge.base, hinge.point, hinge.rotation, share)))
-    return hinged
-
-
-def _hinge(base: Thing, base_at: Located, points: FloatArray) -> tuple[float, Hinge, FloatArray] | None:
-    """The error (metres) of a part with ``points (I, N, 3)`` as one that turns about an axis of ``base``, the hinge,
-    and the part's shape about it; None where nothing swings or no axis is in sight.
-
-    Seen from the base, each point moves on a circle in a plane across the axis: a first guess, which is then fitted.
-    """
-    local = (points - base_at.position[:, None]) @ base_at.rotation
-    swings = local - local.mean(axis=0)
-    frame = np.linalg.svd(swings.reshape(-1, 3), full_matrices=False)[2].T
-    frame[:, 1] *= np.linalg.det(frame)  # right-handed, z along the axis
-    circles = local @ frame[:, :2]  # |p|² = 2 p·c + a constant for each point: linear in the centre c
-    flat = circles - circles.mean(axis=0)
-    square = (circles**2).sum(axis=-1)
-    centre = np.linalg.lstsq(2 * flat.reshape(-1, 2), (square - square.mean(axis=0)).ravel(), rcond=FLAT_CIRCLE)[0]
-    guess = frame @ np.append(centre, (local @ frame[:, 2]).mean())
-    if _off_axis(local, guess, frame)[0] > RIGID_SPREADS * RIGID_SPREAD_M[1]:
-        return None
-
-    def residuals(x: FloatArray) -> FloatArray:
-        rotation = frame @ Rotation.from_rotvec(x[:3]).as_matrix()
-        seen, turned, _ = _about_axis(local, guess + x[3:], rotation)
-        rise = float(np.arcsin(min(abs(rotation[2, 2]), 1.0)))
-        tilt = min(rise, np.pi / 2 - rise) / LEVEL_RAD if base.kind != "rigid" else 0.0
-        return np.concatenate([((seen - turned) / OUTLIER_M).ravel(), [tilt], HINGE_PRIOR * x])
-
-    x = least_squares(residuals, np.zeros(6), loss="soft_l1", max_nfev=20).x
-    hinge = Hinge(base, guess + x[3:], frame @ Rotation.from_rotvec(x[:3]).as_matrix())
-    error, turned, angle = _off_axis(local, hinge.point, hinge.rotation)
-    return (error, hinge, turned[0]) if np.ptp(angle) > LEAST_SWING_RAD else None
-
-
-def _off_axis(local: FloatArray, point: FloatArray, rotation: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """The error (metres) of a part that turns about an axis, its points and angles (`_about_axis`)."""
-    seen, turned, angle = _about_axis(local, point, rotation)
-    return float(np.sqrt(np.median(_squared(seen - turned)))), turned, angle
-
-
-def _about_axis(
-    local: FloatArray, point: FloatArray, rotation: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """``local (I, N, 3)`` in the axes of a hinge, the same for a rigid part that turns about its z, and the part's
-    angles ``(I,)``, continuous, from the first scene's."""
-    seen = (local - point) @ rotation
-    shape = seen[0]
-    for _ in range(2):
-        angle = np.angle((np.conj(_complex(shape)) * _complex(seen)).sum(axis=1))
-        shape = (seen @ rotations_about_vertical(angle)).mean(axis=0)
-    turned = shape @ np.swapaxes(rotations_about_vertical(angle), -1, -2)
-    return seen, turned, angle
+    poses, hand, _ = fit_either_hand(thing.shape, points, thing.kind == "upright", thing.mirrors)
+    return Located(poses[:, :3, :3], poses[:, :3, 3], rms_radius(points, 3) / rms_radius(thing.shape[None], 3), hand)
 
 
 def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArray:
@@ -315,43 +142,16 @@ def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArr
         return fit(np.broadcast_to(shape, points.shape), points, np.ones(points.shape[:2]))
     subsets = np.array(list(combinations(range(len(shape)), size)))
     starts = fit(shape[subsets], points[:, subsets], np.ones((len(points), *subsets.shape)))  # (I, subsets, 4, 4)
-    loss = _squared(_moved(starts, shape) - points[:, None])
+    loss = squared_norm(transform_points(starts, shape) - points[:, None])
     best = np.argmin((loss / (loss + OUTLIER_M**2)).sum(axis=-1), axis=1)
     pose = starts[np.arange(len(points)), best]
     for _ in range(5):
-        residual = _squared(_moved(pose, shape) - points)
+        residual = squared_norm(transform_points(pose, shape) - points)
         pose = fit(np.broadcast_to(shape, points.shape), points, 1 / (1 + residual / OUTLIER_M**2) ** 2)
     return pose
 
 
-def spread(values: FloatArray) -> FloatArray:
-    """Standard deviation over the first axis; from `DEMOS_FOR_MEDIANS` values on from the median absolute deviation."""
-    if len(values) < DEMOS_FOR_MEDIANS:
-        return values.std(axis=0)
-    return robust_std(values)
-
-
-def _mean_shape(points: FloatArray, upright: bool, tolerance: float) -> tuple[FloatArray, bool]:
-    """The centred shape ``(N, 3)`` of which ``points (I, N, 3)`` are noisy, moved copies, and whether it ``mirrors``.
-
-    A reflection keeps all distances, but no motion leads to it: the fit is then off by more than ``tolerance``, metres.
-    """
-    distances = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
-    typical = int(np.argmin(np.abs(distances - np.median(distances, axis=0)).sum(axis=(1, 2))))
-    shape = points[typical] - points[typical].mean(axis=0)
-    _, _, off = _fit_either_hand(shape, points, upright, mirrors=True)
-    mirrored = (off[0] > tolerance) & (off[1] < off[0] / 2)
-    mirrors = mirrored.sum() >= MIRRORED_DEMOS
-    for _ in range(2):
-        poses, hand, _ = _fit_either_hand(shape, points, upright, mirrors)
-        back = (points - poses[:, None, :3, 3]) @ poses[:, :3, :3]
-        back[..., 1] *= hand[:, None]
-        shape = np.median(back, axis=0)
-        shape = shape - shape.mean(axis=0)
-    return shape, bool(mirrors)
-
-
-def _fit_either_hand(
+def fit_either_hand(
     shape: FloatArray, points: FloatArray, upright: bool, mirrors: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Poses ``(I, 4, 4)`` as of `robust_fit`, the hand ``(I,)``, -1 where the mirrored shape fits better, and the root
@@ -359,21 +159,23 @@ def _fit_either_hand(
     """
     shapes = [shape, shape * MIRROR] if mirrors else [shape]
     fits = np.stack([robust_fit(own, points, upright) for own in shapes])
-    fitted = np.stack([_moved(poses, own) for poses, own in zip(fits, shapes, strict=True)])
-    off = np.sqrt(_squared(fitted - points).mean(axis=-1))
+    fitted = np.stack([transform_points(poses, own) for poses, own in zip(fits, shapes, strict=True)])
+    off = np.sqrt(squared_norm(fitted - points).mean(axis=-1))
     best = off.argmin(axis=0)
     return fits[best, np.arange(len(points))], 1.0 - 2.0 * best, off
 
 
-def _moved(poses: FloatArray, points: FloatArray) -> FloatArray:
-    return points @ np.swapaxes(poses[..., :3, :3], -1, -2) + poses[..., None, :3, 3]
+def rms_radius(points: FloatArray, dimensions: int = 2) -> FloatArray:
+    """Of ``points (I, N, 3)``, seen from above or in space: ``(I,)``, metres."""
+    seen = points[..., :dimensions] - points[..., :dimensions].mean(axis=1, keepdims=True)
+    return np.sqrt((seen**2).sum(axis=-1).mean(axis=-1))
 
 
-def _squared(vectors: FloatArray) -> FloatArray:
+def squared_norm(vectors: FloatArray) -> FloatArray:
     return (vectors**2).sum(axis=-1)
 
 
-def _complex(points: FloatArray) -> np.ndarray:
+def as_complex(points: FloatArray) -> np.ndarray:
     """x + iy: turns and sizes seen from above are complex factors."""
     return points[..., 0] + 1j * points[..., 1]
 

@@ -38,7 +38,7 @@ def model_name(spec: str) -> str:
 
 
 def check_server(spec: str) -> None:
-    """One short request where ``spec`` names a server, so that a wrong address, key or model is told before long work.
+    """One short request where ``spec`` names a server, to report a wrong address, key or model before long work.
 
     Raises `UsageError` as `connect` does, `ModelError` where the server cannot be used.
     """

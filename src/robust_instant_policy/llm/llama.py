@@ -65,6 +65,14 @@ class _Layout:
     tokens: int
     is_long: bool = False
 
+    @classmethod
+    def of(cls, tokens: int, most: int) -> _Layout:
+        """For prompts of up to ``tokens``, in a context of ``most``."""
+        if tokens > SHORT_TOKENS:
+            return cls(1, 1, min(-(-tokens // LONG_STEP_TOKENS) * LONG_STEP_TOKENS, most), is_long=True)
+        servers = min(os.cpu_count() or 1, MAX_SERVERS)
+        return cls(servers, -(-SHORT_SLOTS // servers), -(-tokens // SLOT_STEP_TOKENS) * SLOT_STEP_TOKENS)
+
 
 @dataclass(eq=False)
 class _Deadline:
@@ -113,7 +121,7 @@ class LlamaModel:
 
     def _get(self, address: str, body: dict[str, Any] | None = None) -> Any:
         if not self._servers:
-            self._start(_short_layout(SHORT_TOKENS))
+            self._start(_Layout.of(SHORT_TOKENS, SHORT_TOKENS))
         return self._fetch(self._servers[0], address, body)
 
     def _fetch(self, server: Any, address: str, body: dict[str, Any] | None = None) -> Any:
@@ -200,7 +208,7 @@ class LlamaModel:
             need = max(self.count_tokens(query.text) + query.max_tokens for query in by_length[-COUNTED_PROMPTS:])
         if need > self.context_length:
             raise context_error(need - longest.max_tokens, longest.max_tokens, self.context_length)
-        layout = _short_layout(need) if need <= SHORT_TOKENS else _long_layout(need, self.context_length)
+        layout = _Layout.of(need, self.context_length)
         running = self._layout
         if running is not None and running.is_long == layout.is_long and running.tokens >= layout.tokens:
             return running
@@ -313,19 +321,6 @@ def _signals_held() -> Iterator[None]:
 def _free_cores() -> int:
     # llama.cpp's threads spin while they wait for each other: more threads than free cores slow all of them down.
     return max(1, (os.cpu_count() or 1) - round(os.getloadavg()[0]))
-
-
-def _short_layout(tokens: int) -> _Layout:
-    servers = min(os.cpu_count() or 1, MAX_SERVERS)
-    return _Layout(servers, -(-SHORT_SLOTS // servers), _rounded(tokens, SLOT_STEP_TOKENS))
-
-
-def _long_layout(tokens: int, most: int) -> _Layout:
-    return _Layout(1, 1, min(_rounded(tokens, LONG_STEP_TOKENS), most), is_long=True)
-
-
-def _rounded(tokens: int, step: int) -> int:
-    return -(-tokens // step) * step
 
 
 def _common_length(a: str, b: str) -> int:

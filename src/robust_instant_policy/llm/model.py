@@ -92,7 +92,7 @@ class Tally:
     """Which samples of which query are still missing. Safe to use from several threads."""
 
     def __init__(self, num_queries: int, sampling: Sampling, listener: Listener = NOBODY):
-        self._missing = [list(sampling.indices) for _ in range(num_queries)]
+        self._indices = sampling.indices
         self._attempts: list[dict[int, int]] = [{} for _ in range(num_queries)]
         self._accepted: list[dict[int, Answer]] = [{} for _ in range(num_queries)]
         self._total = num_queries * sampling.n
@@ -102,8 +102,8 @@ class Tally:
     def missing(self, query_index: int) -> list[int]:
         """Sample indices without an accepted answer, except those refused `MAX_ROUNDS` times."""
         with self._lock:
-            attempts = self._attempts[query_index]
-            return [index for index in self._missing[query_index] if attempts.get(index, 0) < MAX_ROUNDS]
+            attempts, accepted = self._attempts[query_index], self._accepted[query_index]
+            return [i for i in self._indices if i not in accepted and attempts.get(i, 0) < MAX_ROUNDS]
 
     def attempt(self, query_index: int, index: int) -> int:
         """How often the sample has been refused."""
@@ -113,12 +113,11 @@ class Tally:
     def add(self, query_index: int, index: int, answer: Answer) -> None:
         read = self._listener.read(query_index, answer)
         with self._lock:
-            if index not in self._missing[query_index]:
+            if index in self._accepted[query_index]:
                 return
             attempt = self._attempts[query_index].get(index, 0)
             self._attempts[query_index][index] = attempt + 1
             if read is not None:
-                self._missing[query_index].remove(index)
                 self._accepted[query_index][index] = read
             if self._listener.on_answer is not None:
                 self._listener.on_answer(query_index, index, attempt, read or answer, read is not None)

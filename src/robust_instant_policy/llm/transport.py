@@ -77,7 +77,7 @@ class Connection:
     async def request(self, address: str, body: dict[str, Any] | None = None, timeout_s: float = 5.0) -> Any:
         """The JSON that ``address`` answers to GET, or to POST where there is a ``body``, within ``timeout_s`` in all.
 
-        Raises `UnavailableError`, `RefusedError`, and `ModelError` for what no other request will mend.
+        Raises `UnavailableError`, `RefusedError`, and `ModelError` where another request would fail in the same way.
         """
         try:
             async with (

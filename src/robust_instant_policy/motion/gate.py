@@ -51,8 +51,8 @@ class Gate:
     def start(self, states: Sequence[ArmState]) -> None:
         """Take the measured joints as the last command; raises `StoppedError` if the arms are not ready.
 
-        A gripper that was told to close, or that presses on something, is told to close: the measured width would end
-        its force.
+        A gripper whose command was to close, or that presses on something, keeps the command to close: a command of the
+        measured width would end its force.
         """
         now = time.monotonic()
         self._clocks, self._fresh, self._opening = [-math.inf] * len(states), [now] * len(states), [0] * len(states)
@@ -159,8 +159,8 @@ class Gate:
         return brake
 
     def judge(self, states: Sequence[ArmState]) -> None:
-        """Raise `StoppedError` for states that are no reason to go on: faults, no numbers, stale, far from commanded,
-        or a gripper that does not open."""
+        """Raise `StoppedError` for states in which the arms must stop: faults, values that are no numbers, old states,
+        joints far from their command, a gripper that does not open."""
         for index, (arm, state, told) in enumerate(zip(self._arms, states, self._last, strict=True)):
             if state.faults:
                 raise StoppedError(f"{arm.name} reports: {'; '.join(state.faults)}")
@@ -195,7 +195,7 @@ class Gate:
         return nearest
 
     def _hold(self, index: int, error: FloatArray, name: str) -> None:
-        """Raise `StoppedError` for a joint whose ``error (J,)`` lasts although its command hardly moves: it is held."""
+        """Raise `StoppedError` for a joint whose ``error (J,)`` lasts while its command hardly moves: it is held."""
         limit = HELD_SHARE * self._limits.following_error
         slow = np.abs(self._change[index]) * self._rate < SLOW_RAD_S
         self._held[index] = np.where(slow & (error > limit), self._held[index] + 1, 0)

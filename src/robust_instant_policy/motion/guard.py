@@ -18,7 +18,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.errors import UnreachableError
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, interpolate
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.capsules import ArmShape, Capsules
 from robust_instant_policy.motion.checks import gripper_poses
@@ -262,10 +262,9 @@ def _stretched(motion: Motion, factor: float) -> Motion:
         return motion
     position = np.linspace(0, count - 1, math.ceil((count - 1) * factor) + 1)
     nearest = np.ceil(position - 1e-9).astype(int)
-    fingers = [np.interp(position, np.arange(count), column) for column in motion.fingers.T]
     return Motion(
         PchipInterpolator(np.arange(count), motion.joints)(position),
-        np.stack(fingers, axis=1),
+        interpolate(position, np.arange(count), motion.fingers),
         motion.poses[nearest],
         motion.closed[nearest],
     )

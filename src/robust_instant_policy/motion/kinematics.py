@@ -72,9 +72,9 @@ class Kinematics:
     def body_poses(self, joints: ArrayLike) -> dict[str, FloatArray]:
         """Pose ``(4, 4)`` in the world of each body of the model, by name, at ``joints (J,)``."""
         self._place(joints)
-        data, model = self._configuration.data, self._configuration.model
-        poses = {model.body(i).name: make_pose(data.xmat[i].reshape(3, 3), data.xpos[i]) for i in range(1, model.nbody)}
-        return {name: self.base @ pose for name, pose in poses.items()}
+        data = self._configuration.data
+        poses = self.base @ make_pose(data.xmat.reshape(-1, 3, 3), data.xpos)
+        return {self.model.body(body).name: poses[body] for body in range(1, len(poses))}
 
     def follow(self, poses: ArrayLike, start: ArrayLike) -> JointPath:
         """Joint angles along tool ``poses (N, 4, 4)``, each solved from the previous one, the first from ``start``."""

@@ -1,4 +1,4 @@
-"""What an arm is told and what it measures."""
+"""Commands for an arm, and its measured state."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ OPEN = 0.9  # share of its travel from which a gripper is open
 
 @dataclass(frozen=True, eq=False)
 class Command:
-    """What an arm is told: ``joints (J,)`` rad and the travel of each finger from closed (0), metres."""
+    """A command for an arm: ``joints (J,)`` rad and the travel of each finger from closed (0), metres."""
 
     joints: FloatArray
     finger_travel: float

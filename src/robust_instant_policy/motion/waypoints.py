@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, interpolate, make_pose
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.checks import check_clearance, check_joint_changes, check_reach, gripper_poses
 from robust_instant_policy.trajectory import Trajectory
@@ -136,8 +136,7 @@ def plan_poses(
     check_joint_changes(change, arms, steps)
     count = np.maximum(np.ceil(change * rate_hz / [arm.joint_speed for arm in arms]).max(axis=1), 1).astype(int)
     position = np.repeat(np.arange(len(poses)), count) - 1 + np.concatenate([np.arange(1, n + 1) / n for n in count])
-    columns = joints.reshape(len(poses), -1).T
-    slowed = np.stack([np.interp(position, np.arange(len(poses)), column) for column in columns], axis=1)
+    slowed = interpolate(position, np.arange(len(poses)), joints.reshape(len(poses), -1))
     nearest = np.ceil(position - 1e-9).clip(0).astype(int)
     return Motion(
         slowed.reshape(-1, *joints.shape[1:]),
@@ -152,11 +151,9 @@ def _interpolate(times: FloatArray, knots: FloatArray, at: FloatArray) -> FloatA
 
     Positions by monotone cubics (Fritsch and Carlson 1980), rotations by spherical linear interpolation.
     """
-    poses = np.tile(np.eye(4), (len(at), knots.shape[1], 1, 1))
-    poses[..., :3, 3] = PchipInterpolator(times, knots[..., :3, 3])(at)
-    for arm in range(knots.shape[1]):
-        poses[:, arm, :3, :3] = Slerp(times, Rotation.from_matrix(knots[:, arm, :3, :3]))(at).as_matrix()
-    return poses
+    arms = np.moveaxis(knots[..., :3, :3], 1, 0)
+    rotations = [Slerp(times, Rotation.from_matrix(own))(at).as_matrix() for own in arms]
+    return make_pose(np.stack(rotations, axis=1), PchipInterpolator(times, knots[..., :3, 3])(at))
 
 
 def _finger_ramp(closed: np.ndarray, travel: FloatArray, arms: Sequence[Arm], rate_hz: float) -> FloatArray:

@@ -18,7 +18,7 @@ from robust_instant_policy.policies.confidence import (
     undecided,
 )
 from robust_instant_policy.policies.context import Context, LocatedScene
-from robust_instant_policy.policies.policy import FrameUse, Plan, Stage, Stopwatch, Usage
+from robust_instant_policy.policies.policy import Plan, Stage, Stopwatch, Usage
 from robust_instant_policy.policies.sampling import Proposal
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.regression import RobustTrajectory, robust_gripper_trajectory
@@ -96,7 +96,7 @@ def make_plan(
     frames = context.prompt.for_scene(scene.keypoints).frames
     evidence = Evidence(
         agreement=chosen.confidence,
-        vote=context.prompt.vote(scene.keypoints),
+        vote=context.prompt.decide(scene.keypoints)[1],
         distortion=distortion(context.keypoints, scene.keypoints),
         prediction=best,
         novelty=novelty(context.keypoints, scene.keypoints),
@@ -129,7 +129,7 @@ def make_plan(
         usage=Usage((scene.stage, *proposal.stages, *stages)),
         seconds=context.pace.seconds if context.pace else None,
         dwell=context.pace.dwell if context.pace else None,
-        frames=tuple(FrameUse(*use) for use in frames.uses(scene.keypoints)),
+        frames=frames.uses(scene.keypoints),
         notes=(
             *context.notes,
             *scene.notes,

@@ -6,7 +6,8 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from robust_instant_policy.errors import MissingExtraError, UnknownNameError
+from robust_instant_policy.checks import check_name
+from robust_instant_policy.errors import MissingExtraError
 from robust_instant_policy.llm import DEADLINE_S, LanguageModel
 from robust_instant_policy.policies.gp import KeypointRegression
 from robust_instant_policy.policies.instant import KeypointActionTokens
@@ -40,8 +41,7 @@ def make_policy(
 
     Those of `TRAINED_METHODS` train as ``training`` says, and raise `MissingExtraError` without their extra.
     """
-    if name not in METHOD_NAMES:
-        raise UnknownNameError("method", name, METHOD_NAMES)
+    check_name("method", name, METHOD_NAMES)
     if name in TRAINED_METHODS:
         return make_trained_policy(name, settings, training or Training())
     if name == "neighbours":

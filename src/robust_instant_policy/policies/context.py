@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from robust_instant_policy.context import Prompt, leave_one_out, write_prompt
-from robust_instant_policy.context.alignment import align
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.geometry import FloatArray
@@ -87,17 +86,8 @@ def build_context(
     report.raise_if_wrong()
     progress("keypoints", 0, 0)
     extractor = _extractor(demonstrations, settings)
-    observations = [one.observation for one in demonstrations]
-    given = _context(extractor.keypoints_, [one.trajectory for one in demonstrations], settings, observations)
-    return replace(
-        given,
-        demonstrations=tuple(demonstrations),
-        extractor=extractor,
-        pixels=extractor.pixels_,
-        report=report,
-        pace=Pace.of(demonstrations),
-        notes=(*extractor.notes_, *report.notes, *given.notes),
-    )
+    trajectories = [one.trajectory for one in demonstrations]
+    return _context(extractor.keypoints_, trajectories, settings, report, demonstrations, extractor)
 
 
 def _extractor(demonstrations: Sequence[Demonstration], settings: Settings) -> KeypointExtractor | OwnKeypoints:
@@ -118,31 +108,35 @@ def context_of_keypoints(keypoints: FloatArray, trajectories: Sequence[Trajector
 
     There are no images to check; a plan is still held against the envelope of ``trajectories``.
     """
-    return _context(keypoints, trajectories, settings)
+    report = SetReport((), Envelope.of(trajectories, HORIZONTAL), None)
+    return _context(keypoints, trajectories, settings, report)
 
 
 def _context(
     keypoints: FloatArray,
     trajectories: Sequence[Trajectory],
     settings: Settings,
-    observations: Sequence[Observation] = (),
+    report: SetReport,
+    demonstrations: Sequence[Demonstration] = (),
+    extractor: KeypointExtractor | OwnKeypoints | None = None,
 ) -> Context:
-    """What keypoints, trajectories and, where there are any, ``observations`` of demonstrations give."""
+    """Thin the ``trajectories`` out and serialise them; with ``demonstrations`` where there is more than these."""
     thinned = tuple(downsample(one, settings.downsampling, settings.num_steps) for one in trajectories)
     prompt = write_prompt(keypoints, thinned, settings.frames, settings.layout)
-    aligned = align(thinned)
-    views = [View.of(observations[index]) for index in aligned.kept] if observations else []
+    aligned = prompt.aligned
+    views = [View.of(demonstrations[index].observation) for index in aligned.kept] if demonstrations else []
     return Context(
-        (),
-        None,
+        tuple(demonstrations),
+        extractor,
         keypoints,
-        np.zeros((len(keypoints), 0, 2)),
+        np.zeros((len(keypoints), 0, 2)) if extractor is None else extractor.pixels_,
         thinned,
         prompt,
-        SetReport((), Envelope.of(trajectories, HORIZONTAL), None),
+        report,
         Surroundings.of(views, aligned.actions),
-        leave_one_out(keypoints, thinned, prompt),
-        prompt.notes(),
+        leave_one_out(prompt),
+        (*(() if extractor is None else extractor.notes_), *report.notes, *prompt.notes()),
+        Pace.of(demonstrations) if demonstrations else None,
     )
 
 

@@ -1,4 +1,4 @@
-"""A Gaussian process from keypoints to each step: the cheap learner that every expensive one must beat."""
+"""A Gaussian process from keypoints to each step: a fast baseline for the language models."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from robust_instant_policy.context.alignment import align
 from robust_instant_policy.context.codec import MM
 from robust_instant_policy.context.step_frames import StepFrames
 from robust_instant_policy.geometry import FloatArray
@@ -91,7 +90,7 @@ class KeypointRegression(KeypointPolicy):
     def fit_context(self, context: Context) -> Self:
         """Find the kernel's parameters for each way to act, in a fraction of a second; returns itself."""
         super().fit_context(context)
-        aligned = align(context.trajectories)
+        aligned = context.prompt.aligned
         if self.settings.frames == "world":
             num_steps = aligned.actions.shape[1]
             ways = [(StepFrames.world(num_steps, aligned.num_arms), aligned.kept)]
@@ -108,7 +107,7 @@ class KeypointRegression(KeypointPolicy):
         return self
 
     def plan_scene(self, scene: LocatedScene) -> Plan:
-        way = 0 if len(self.ways_) == 1 else self.context_.prompt.way(scene.keypoints)
+        way = 0 if len(self.ways_) == 1 else self.context_.prompt.decide(scene.keypoints)[0]
         frames, median, process = self.ways_[way]
         watch = Stopwatch()
         with watch.stage("gaussian process"):
@@ -127,7 +126,7 @@ def _fitted(
 ) -> tuple[StepFrames, FloatArray, GaussianProcess]:
     """``frames``, the median in them of ``actions (I, T, 10·A)`` in scenes with ``keypoints (I, K, 3)``, and the
     process of the differences from it."""
-    numbers = np.stack([frames.encode(points, own) for points, own in zip(keypoints, actions, strict=True)])
+    numbers = frames.encode(frames.poses(keypoints), actions)
     median = np.median(numbers, axis=0)
     residuals = (numbers - median) / MM
     inputs = keypoints.reshape(len(keypoints), -1)

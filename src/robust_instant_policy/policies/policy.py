@@ -15,7 +15,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from robust_instant_policy.checks import checked_positive, is_finite
+from robust_instant_policy.checks import checked_array, checked_positive, is_finite
+from robust_instant_policy.context.frames import FrameUse
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError, KeypointError, PlanningError
@@ -87,18 +88,6 @@ class Stopwatch:
         start = time.perf_counter()
         yield
         self.stages.append(Stage(name, time.perf_counter() - start))
-
-
-@dataclass(frozen=True, eq=False)
-class FrameUse:
-    """A frame in which the steps ``first`` to ``last`` of an arm were planned, in ``words``, and the last step's pose
-    ``(4, 4)``."""
-
-    words: str
-    arm: int
-    first: int
-    last: int
-    pose: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,12 +244,10 @@ def _stage(content: dict) -> Stage:
 
 
 def _frame(content: dict) -> FrameUse:
-    frame = FrameUse(**{**content, "pose": as_numbers("pose", content["pose"])})
+    frame = FrameUse(**{**content, "pose": checked_array("the pose of a frame", content["pose"], "(4, 4)")})
     steps = frame.arm, frame.first, frame.last
     if not isinstance(frame.words, str) or not all(isinstance(step, int) for step in steps):
         raise ValueError("its frames hold something other than words and steps")
-    if frame.pose.shape != (4, 4) or not np.isfinite(frame.pose).all():
-        raise ValueError(f"the pose of a frame must be (4, 4) and finite, got {frame.pose.shape}")
     return frame
 
 

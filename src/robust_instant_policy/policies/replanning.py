@@ -1,4 +1,4 @@
-"""A keypoint method in closed loop: look again after a while, and go on from where the arm is."""
+"""A keypoint method in closed loop: it plans again from a new image after some waypoints."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ Z = slice(2, STATE_INDEX, 3)  # heights of an arm's three points
 
 
 class Replanning:
-    """``policy``, which looks again after every ``every`` waypoints. See `policies.ClosedLoopPolicy`.
+    """``policy``, which plans again after every ``every`` waypoints. See `policies.ClosedLoopPolicy`.
 
-    While a gripper is closed the plan is kept, because what it holds moves with the hand. A motion that has come to its
-    end is made once more from a new look; whoever executes ends the episode where the task is done.
+    While a gripper is closed the plan is kept, because what it holds moves with the hand. After its end the whole
+    motion is planned and made once more; the caller ends the episode where the task is done.
     """
 
     max_seconds = math.inf  # the controller ends by itself

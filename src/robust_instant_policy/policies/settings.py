@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 from numpy.typing import ArrayLike
 
-from robust_instant_policy.checks import checked_positive, checked_whole
+from robust_instant_policy.checks import check_name, checked_positive, checked_whole
 from robust_instant_policy.context import Frames, Layout
 from robust_instant_policy.errors import InvalidValueError, UnknownNameError, UsageError
 from robust_instant_policy.geometry import as_numbers
@@ -90,17 +90,17 @@ class Settings:
         their Table II, "paper-real" the same with the columns "Real": DINO keypoints by nearest neighbours, whole
         trajectories in the world frame in one prompt, and the mean of the networks.
         """
-        if config not in CONFIGS:
-            raise UnknownNameError("config", config, tuple(CONFIGS))
+        check_name("config", config, CONFIGS)
         return cls(**CONFIGS[config])
 
     @property
     def of_context(self) -> Settings:
         """These settings with what the context does not depend on at its default: equal ones give equal contexts."""
-        return self._only(
+        names = (
             "num_keypoints", "features", "column", "keypoints", "workspace", "downsampling", "num_steps", "frames",
-            "layout",
+            "layout", "seed",
         )  # fmt: skip
+        return Settings(**{name: getattr(self, name) for name in names})
 
     @property
     def descriptors(self) -> DescriptorSettings | None:
@@ -119,9 +119,6 @@ class Settings:
             if name not in known:
                 raise UsageError(f"unknown setting {name!r}; known: {', '.join(known)}")
         return replace(self, **options)  # type: ignore[arg-type]
-
-    def _only(self, *names: str) -> Settings:
-        return Settings(seed=self.seed, **{name: getattr(self, name) for name in names})
 
 
 def _corners(workspace: ArrayLike) -> tuple[tuple[float, ...], ...]:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from robust_instant_policy.checks import checked_array
 from robust_instant_policy.errors import InvalidValueError
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, interpolate
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,17 +94,8 @@ class Candidates:
         """All candidates ``(Q, M, D)`` interpolated linearly at ``times (M,)``."""
         if self.synchronous and np.array_equal(times, self.grid()):
             return self.values.reshape(len(self), -1, self.num_dimensions)
-        return np.stack(
-            [
-                interpolate(times, clock, block)
-                for clock, block in zip(self.split(self.times), self.split(self.values), strict=True)
-            ]
-        )
-
-
-def interpolate(at: FloatArray, times: FloatArray, values: FloatArray) -> FloatArray:
-    """``values (T, D)`` at ``times (T,)``, linearly interpolated at ``at (M,)``: ``(M, D)``."""
-    return np.stack([np.interp(at, times, column) for column in values.T], axis=1)
+        each = zip(self.split(self.times), self.split(self.values), strict=True)
+        return np.stack([interpolate(times, clock, block) for clock, block in each])
 
 
 def _checked_list(name: str, arrays: Sequence[ArrayLike], shape: str) -> list[ArrayLike]:

@@ -74,7 +74,7 @@ def expected_precision(distance: FloatArray, dof: float) -> FloatArray:
 
 
 def fit_numbers(actions: ArrayLike, dof: float = DEFAULT_DOF) -> Estimate:
-    """Minimise Eq. 2 for one number, of which Q candidates ``actions (Q, T)`` speak at T steps (Oh et al. 2025, Eq. 3).
+    """Minimise Eq. 2 for one number, given by Q candidates at T steps: ``actions (Q, T)`` (Oh et al. 2025, Eq. 3).
 
     This is the paper's model and nothing else: every step has its own μ and σ; σ has a floor, without which L is
     unbounded below where most candidates coincide. `StudentTRegression` is the estimator to use.

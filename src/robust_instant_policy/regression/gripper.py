@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robust_instant_policy.checks import checked_array, checked_positive, checked_whole
-from robust_instant_policy.errors import InvalidValueError, UnknownNameError
+from robust_instant_policy.checks import check_name, checked_array, checked_positive, checked_whole
+from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.regression.candidates import Candidates, group_matrix
 from robust_instant_policy.regression.diagnosis import judge, scaled_residuals
@@ -83,8 +83,7 @@ def robust_gripper_trajectory(
     by less is not called hallucinated. The trajectory does not depend on it. ``bends`` is the old name of curvature.
     """
     dof, seed = checked_positive("dof", dof, infinite=True), checked_whole("seed", seed)
-    if estimator not in ESTIMATORS:
-        raise UnknownNameError("estimator", estimator, ESTIMATORS)
+    check_name("estimator", estimator, ESTIMATORS)
     tolerance, expected = checked_positive("tolerance", tolerance), checked_curvature(curvature, bends)
     usual = None if variation is None else _checked_variation(variation)
     if not isinstance(triangle, GripperTriangle | None):
@@ -97,6 +96,8 @@ def robust_gripper_trajectory(
     count = int(np.median(data.lengths)) if num_steps is None else checked_whole("num_steps", num_steps, 1)
     at = np.linspace(0.0, 1.0, count)
     is_state = np.arange(data.num_dimensions) % ACTION_DIM == STATE_INDEX
+
+    # 1. Fit the points: where the grippers go, and how much each candidate counts.
     points = Candidates(data.values[:, ~is_state], data.times, data.starts)
     fit, residuals = _fit_points(points, dof, estimator, seed, expected, usual)
     by_number = _fit_numbers(data, dof, estimator, seed)
@@ -106,31 +107,32 @@ def robust_gripper_trajectory(
     share = _share_at_ties(points, at, tolerance)
     if estimator != "mean":
         weights = np.minimum(weights, share)
-
-    actions, scale = np.empty((count, data.num_dimensions)), np.empty((count, data.num_dimensions))
     if by_number is not None:
         mean = by_number.mean(at)[:, ~is_state]
     else:
         mean = np.median(points.at(at), axis=0) if estimator == "median" else fit.mean(at)
+
+    # 2. Vote on the states, with these weights.
+    closed = data.values[:, is_state] > 0.5  # (N, A)
+    votes = np.stack([_nearest_in_time(at, c, own) for c, own in zip(clocks, data.split(closed), strict=True)])
+    each = weights[..., None]  # (Q, T, 1)
+    if by_number is not None:
+        state = by_number.mean(at)[:, is_state] > 0.5
+    else:
+        # the cost keeps out a change for a single step, even a unanimous one
+        cost = TRANSITION_COST * float(weights.sum(axis=0).mean())
+        state = viterbi(np.where(votes, each, -each).sum(axis=0).T, cost).T
+
+    # 3. What the arm executes: rigid grippers, open or closed.
+    actions, scale = np.empty((count, data.num_dimensions)), np.empty((count, data.num_dimensions))
+    actions[:, ~is_state], actions[:, is_state] = _rigid(mean, points.values, triangle), state
     scale[:, ~is_state] = fit.scale(at)
-    scaled = np.zeros_like(data.values)
+    scale[:, is_state] = (each * (votes != state)).sum(axis=0) / np.maximum(each.sum(axis=0), 1e-12)
+
+    # 4. Which candidates leave the agreement.
+    scaled = np.empty_like(data.values)
     scaled[:, ~is_state] = residuals
-    for arm, column in enumerate(np.flatnonzero(is_state)):
-        place = slice(column - STATE_INDEX, column)
-        triplets = mean[:, arm * STATE_INDEX : (arm + 1) * STATE_INDEX].reshape(count, 3, 3)
-        known = triangle or GripperTriangle.from_triplets(data.values[:, place].reshape(-1, 3, 3))
-        actions[:, place] = known.triplets(known.poses(triplets)).reshape(count, STATE_INDEX)
-        closed = data.values[:, column] > 0.5
-        votes = np.stack([_nearest_in_time(at, c, own) for c, own in zip(clocks, data.split(closed), strict=True)])
-        if by_number is not None:
-            state = by_number.mean(at)[:, column] > 0.5
-        else:
-            # the cost keeps out a change for a single step, even a unanimous one
-            cost = TRANSITION_COST * float(weights.sum(axis=0).mean())
-            state = viterbi(np.where(votes, weights, -weights).sum(axis=0), cost)
-        actions[:, column] = state
-        scale[:, column] = (weights * (votes != state)).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-12)
-        scaled[:, column] = (closed != _nearest_in_time(data.times, at, state)) / STATE_SCALE
+    scaled[:, is_state] = (closed != _nearest_in_time(data.times, at, state)) / STATE_SCALE
     verdict = judge(data.split(scaled))
     return RobustTrajectory(
         actions,
@@ -143,6 +145,15 @@ def robust_gripper_trajectory(
         verdict.dimensions,
         0.0 if (share < 1).any() else confidence(fit.standard_error(at), weights, tolerance),
     )
+
+
+def _rigid(mean: FloatArray, measured: FloatArray, triangle: GripperTriangle | None) -> FloatArray:
+    """The points ``mean (T, 9·A)`` of rigid grippers of the shape ``triangle``, or else as ``measured (N, 9·A)``."""
+    num_arms, rigid = mean.shape[1] // STATE_INDEX, []
+    for triplets, own in zip(np.split(mean, num_arms, axis=1), np.split(measured, num_arms, axis=1), strict=True):
+        known = triangle or GripperTriangle.from_triplets(own.reshape(-1, 3, 3))
+        rigid.append(known.triplets(known.poses(triplets.reshape(-1, 3, 3))).reshape(triplets.shape))
+    return np.concatenate(rigid, axis=1)
 
 
 def _fit_points(

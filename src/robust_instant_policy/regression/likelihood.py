@@ -30,7 +30,7 @@ from robust_instant_policy.regression.em import (
     log_density,
 )
 
-PRIOR_SAMPLES = 2.0  # candidates' worth of trust in the scale of all steps, against that of one step alone
+PRIOR_SAMPLES = 2.0  # weight, in candidates, of the scale of all steps against that of one step
 PAIRWISE_LIMIT = 4_000_000  # numbers compared pair by pair to find a start; beyond it there are enough for a median
 CORNER_DOF = 2.0  # ν_G: most second differences are small, a few are corners, which are not smoothed
 FAINT_PRICE = 1e-6  # on second differences, which ties down knots between which no candidate has a sample

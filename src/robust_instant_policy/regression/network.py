@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import gammaln
 
-from robust_instant_policy.checks import checked_array, checked_positive, checked_whole
-from robust_instant_policy.errors import InvalidValueError, MissingExtraError, UnknownNameError, UsageError
+from robust_instant_policy.checks import check_name, checked_array, checked_positive, checked_whole
+from robust_instant_policy.errors import InvalidValueError, MissingExtraError, UsageError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression.candidates import Candidates
 from robust_instant_policy.regression.em import DEFAULT_DOF, expected_precision
@@ -63,8 +63,7 @@ class StudentTNetwork:
     """
 
     def __init__(self, dof: float = DEFAULT_DOF, recipe: str = "fast", seed: int = 0, target: float | None = None):
-        if recipe not in (*RECIPES, "fast"):
-            raise UnknownNameError("recipe", recipe, (*RECIPES, "fast"))
+        check_name("recipe", recipe, (*RECIPES, "fast"))
         if target is not None and (isinstance(target, bool) or not isinstance(target, Real) or np.isnan(target)):
             raise InvalidValueError(f"target must be a number or None, got {target!r} ({type(target).__name__})")
         self.dof = checked_positive("dof", dof, infinite=True)

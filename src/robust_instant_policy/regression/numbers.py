@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from robust_instant_policy.checks import checked_array, checked_positive
 from robust_instant_policy.errors import UsageError
-from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.regression.candidates import Candidates, interpolate
+from robust_instant_policy.geometry import FloatArray, interpolate
+from robust_instant_policy.regression.candidates import Candidates
 from robust_instant_policy.regression.em import DEFAULT_DOF, fit_numbers
 
 

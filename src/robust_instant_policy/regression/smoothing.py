@@ -7,13 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from robust_instant_policy.regression.curve import multiply_banded, solve_banded
-from robust_instant_policy.regression.likelihood import (
-    Fit,
-    Problem,
-    mean_over_scale,
-    normal_equations,
-    prices,
-)
+from robust_instant_policy.regression.likelihood import Fit, Problem, mean_over_scale, normal_equations, prices
 
 STIFFNESSES = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0])  # λ that are tried, in 1/σ²
 CORNER_SWEEPS = 2  # reweightings of the second differences at each stiffness tried

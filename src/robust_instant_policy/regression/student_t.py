@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from robust_instant_policy.checks import checked_array, checked_positive
-from robust_instant_policy.errors import InvalidValueError, UnknownNameError, UsageError
-from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.regression.candidates import Candidates, group_matrix, interpolate
+from robust_instant_policy.checks import check_name, checked_array, checked_positive
+from robust_instant_policy.errors import InvalidValueError, UsageError
+from robust_instant_policy.geometry import FloatArray, interpolate
+from robust_instant_policy.regression.candidates import Candidates, group_matrix
 from robust_instant_policy.regression.em import DEFAULT_DOF, MAX_ITERATIONS
 from robust_instant_policy.regression.likelihood import Fit, Problem, improve, maximise, pose_problem
 from robust_instant_policy.regression.modes import share_at_ties
@@ -80,8 +80,7 @@ class StudentTRegression:
         *,
         bends: ArrayLike | None = None,
     ):
-        if unit not in UNITS:
-            raise UnknownNameError("unit", unit, UNITS)
+        check_name("unit", unit, UNITS)
         self.dof = checked_positive("dof", dof, infinite=True)
         self.unit = unit
         self.groups = groups

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.geometry import FloatArray, make_pose
 
 SPEED_SPREAD = 0.15  # standard deviation of the log of an episode's and a stroke's speed
 MIN_STROKE_S = 0.35
@@ -133,10 +133,8 @@ def _move(here: FloatArray, stroke: Stroke, pace: float, rng: np.random.Generato
     count = max(int(np.ceil(max(along[-1] / speed, MIN_STROKE_S) * rate_hz)), 2)
     time = (np.arange(1, count + 1) / count) ** np.exp(rng.normal(0.0, SKEW_SPREAD))
     at = along[-1] * (10 * time**3 - 15 * time**4 + 6 * time**5)
-    path = np.tile(np.eye(4), (count, 1, 1))
-    path[:, :3, 3] = CubicSpline(along, knots[:, :3, 3], bc_type="natural")(at)
-    path[:, :3, :3] = Slerp(along, rotations)(np.minimum(at, along[-1])).as_matrix()
-    return path
+    places = CubicSpline(along, knots[:, :3, 3], bc_type="natural")(at)
+    return make_pose(Slerp(along, rotations)(np.minimum(at, along[-1])).as_matrix(), places)
 
 
 def _bow(start: FloatArray, stop: FloatArray, rng: np.random.Generator) -> FloatArray:

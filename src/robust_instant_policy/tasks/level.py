@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from robust_instant_policy.errors import UnknownNameError
+from robust_instant_policy.checks import check_name
+from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, make_pose, transform_points
 from robust_instant_policy.tasks.camera_noise import CameraNoise
 from robust_instant_policy.tasks.textures import Color
@@ -57,17 +58,23 @@ class Level:
     start: float = 0.0
     objects: str = "seen"
 
+    def photographed(self, scene: Observation, seed: int, number: int) -> Observation:
+        """Image ``number`` of a ``scene``, with the noise of the camera; it depends on the scene's ``seed``, too."""
+        if self.camera is None:
+            return scene
+        return self.camera.photograph(scene, int(np.random.SeedSequence([seed, number]).generate_state(1)[0]))
+
 
 PAPER = Level("paper")
 HARD = Level("hard", CameraNoise(), np.pi, (2, 5), furnishing=True, hides=True, start=0.08, objects="unseen")
 NOISE = Level("noise", CameraNoise())
 LEVELS = {level.name: level for level in (PAPER, NOISE, HARD)}
+CAMERA_LEVELS = (PAPER.name, NOISE.name)  # of scenes that a benchmark draws: only the camera varies
 
 
 def make_level(name: str) -> Level:
     """The level called ``name``; raises `UnknownNameError`."""
-    if name not in LEVELS:
-        raise UnknownNameError("level", name, tuple(LEVELS))
+    check_name("level", name, LEVELS)
     return LEVELS[name]
 
 

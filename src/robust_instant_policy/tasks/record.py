@@ -5,44 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from inspect import signature
-from typing import Any, Protocol
+from typing import Any
 
-from robust_instant_policy.demonstration import Demonstration
+from robust_instant_policy.datasets import DatasetWriter
 from robust_instant_policy.errors import RipError, UsageError
-from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.interrupts import raise_pending
-from robust_instant_policy.tasks.task import Image, Task, require
+from robust_instant_policy.tasks.task import Task, require
 
 MAX_FAILURES_IN_A_ROW = 50  # after as many failures in a row, recording stops
 
 Progress = Callable[[int, int, int], None]
 
 
-class DemonstrationWriter(Protocol):
-    """Destination of demonstrations; `datasets.DatasetWriter` is one.
-
-    ``last_seed`` is the last seed tried; ``discarded`` is the number of discarded attempts.
-    """
-
-    @property
-    def num_episodes(self) -> int: ...
-
-    @property
-    def last_seed(self) -> int | None: ...
-
-    @property
-    def discarded(self) -> int: ...
-
-    def add(
-        self, demonstration: Demonstration, images: Image | None = None, grippers: FloatArray | None = None
-    ) -> None: ...
-
-    def discard(self, seed: int | None = None) -> None: ...
-
-
 def record(
     task: Task,
-    writer: DemonstrationWriter,
+    writer: DatasetWriter,
     num_episodes: int,
     seed: int = 0,
     with_images: bool = False,

@@ -10,9 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from robust_instant_policy.checks import check_name
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import RipError, UnknownNameError, UnreachableError
+from robust_instant_policy.errors import RipError, UnreachableError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.waypoints import plan_onward, plan_poses, plan_waypoints
@@ -32,7 +33,7 @@ Expert = Callable[[Any, np.random.Generator], Sequence[Stroke]]
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """Definition of a task: its environment, and the expert that demonstrates it.
+    """Definition of a task, and the expert that demonstrates it.
 
     ``expert(env, rng)`` has access to the simulator's state. ``object_sets`` and ``asset_sources`` are the available
     choices.
@@ -41,20 +42,22 @@ class TaskSpec:
     name: str
     description: str
     goal: str
-    env_id: str
     expert: Expert
     object_sets: tuple[str, ...] = ("seen",)
     asset_sources: tuple[str, ...] = ("code",)
+
+    @property
+    def env_id(self) -> str:
+        """Name of the environment: "push-cube" is "RIP-PushCube-v1"."""
+        return f"RIP-{self.name.title().replace('-', '')}-v1"
 
 
 def spec_of(module: str, objects: str, assets: str) -> TaskSpec:
     """``SPEC`` of ``module``, if it has the set of ``objects`` and the source of ``assets``; else raises
     `UnknownNameError`."""
     spec: TaskSpec = import_module(module).SPEC
-    if objects not in spec.object_sets:
-        raise UnknownNameError(f"set of objects of {spec.name}", objects, spec.object_sets)
-    if assets not in spec.asset_sources:
-        raise UnknownNameError(f"source of assets of {spec.name}", assets, spec.asset_sources)
+    check_name(f"set of objects of {spec.name}", objects, spec.object_sets)
+    check_name(f"source of assets of {spec.name}", assets, spec.asset_sources)
     return spec
 
 
@@ -126,10 +129,7 @@ class SimulatedTask:
         return self.look()
 
     def execute(self, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
-        if self._seed is None:
-            raise RipError("no scene to execute in; call reset(seed) first")
-        if not self._fresh:
-            self._rebuild(self._seed)
+        self._begin()
         control_hz = self._timing.control_hz
         motion = plan_waypoints(trajectory, self._arms, self.execute_hz, control_hz)
         tracking_error = self._play(motion, self._filming(on_frame))
@@ -137,10 +137,7 @@ class SimulatedTask:
         return Execution(not failure, failure, len(motion.joints) / control_hz, tracking_error)
 
     def follow(self, controller: Controller, max_seconds: float, on_frame: FrameSink | None = None) -> Execution:
-        if self._seed is None:
-            raise RipError("no scene to act in; call reset(seed) first")
-        if not self._fresh:
-            self._rebuild(self._seed)
+        self._begin()
         control_hz = self._timing.control_hz
         before_step = self._filming(on_frame)
         motion = Motion.at_home(self._arms)
@@ -213,6 +210,13 @@ class SimulatedTask:
     def close(self) -> None:
         self._cell.close()
 
+    def _begin(self) -> None:
+        """Have the scene of the last `reset` as it was drawn."""
+        if self._seed is None:
+            raise RipError("no scene to execute in; call reset(seed) first")
+        if not self._fresh:
+            self._rebuild(self._seed)
+
     def _rebuild(self, seed: int) -> None:
         self._cell.reset(seed=bounded_seed(seed, SEED_BITS))
         self._seed, self._fresh, self._images = seed, True, 0
@@ -221,11 +225,8 @@ class SimulatedTask:
 
     def look(self) -> Observation:
         """What the camera sees now, with the noise of the level."""
-        seen, self._images = self._cell.photograph(), self._images + 1
-        if self._level.camera is None:
-            return seen
-        seed = np.random.SeedSequence([self._seed or 0, self._images]).generate_state(1)[0]
-        return self._level.camera.photograph(seen, int(seed))
+        self._images += 1
+        return self._level.photographed(self._cell.photograph(), self._seed or 0, self._images)
 
     def _recorded(self, poses: FloatArray, every: int) -> range:
         """Indices of the recorded control steps; they include the last one, at which success is judged."""
@@ -248,12 +249,10 @@ class SimulatedTask:
 
     def _filming(self, on_frame: FrameSink | None) -> Callable[[], None]:
         """Returns a function to call before each control step; it passes video frames to ``on_frame``."""
-        if on_frame is None:
-            return _nothing
         step = count()
 
         def before_step() -> None:
-            if next(step) % self._timing.frame_every == 0:
+            if on_frame is not None and next(step) % self._timing.frame_every == 0:
                 on_frame(self._cell.video_frame())
 
         return before_step
@@ -280,7 +279,3 @@ class SimulatedTask:
     def _rest(self, motion: Motion) -> None:
         for _ in range(int(SETTLE_SECONDS * self._timing.control_hz)):
             self._cell.advance(motion.commands[-1])
-
-
-def _nothing() -> None:
-    """Called before each control step when nothing is recorded."""

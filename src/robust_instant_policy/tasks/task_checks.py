@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,10 +77,9 @@ class _Checks:
             except (TypeError, ValueError):
                 corners = np.zeros(0)
             if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
-                self.wrong(
+                self.stop(
                     "attribute", f"workspace must be (2, 3), lower and upper corner in metres, got {task.workspace!r}"
                 )
-                raise _Broken
 
     def scenes(self) -> None:
         self.observations = [self.called("reset", Observation, seed) for seed in self.seeds]
@@ -94,10 +93,9 @@ class _Checks:
             self.doubt("scenes", f"the scenes of {len(self.seeds)} seeds look the same; draw them from the seed")
         read = np.isfinite(first.depth) & (first.depth > 0)
         if read.mean() < LEAST_DEPTH:
-            self.wrong(
+            self.stop(
                 "depth", f"only {read.mean():.0%} of the pixels have a depth; is it in metres along the optical axis?"
             )
-            raise _Broken
         try:
             for scene in self.observations:
                 encode_depth(scene.depth)
@@ -170,15 +168,12 @@ class _Checks:
                 continue
             if not isinstance(attempt.demonstration, Demonstration):
                 got = type(attempt.demonstration).__name__
-                self.wrong("demonstration", f"demonstrate({seed}) succeeds without a Demonstration, got {got}")
-                raise _Broken
+                self.stop("demonstration", f"demonstrate({seed}) succeeds without a Demonstration, got {got}")
             shown.append((seed, attempt.demonstration))
             if not _same(attempt.demonstration.observation, scene):
-                self.wrong("demonstration", f"the observation of demonstrate({seed}) is not that of reset({seed})")
-                raise _Broken
+                self.stop("demonstration", f"the observation of demonstrate({seed}) is not that of reset({seed})")
         if not shown:
-            self.wrong("demonstration", f"the demonstrator succeeds in none of {len(self.seeds)} scenes")
-            raise _Broken
+            self.stop("demonstration", f"the demonstrator succeeds in none of {len(self.seeds)} scenes")
         seed, first = shown[0]
         if first.trajectory.num_arms != len(self.task.end_effectors):
             self.wrong(
@@ -242,15 +237,18 @@ class _Checks:
         try:
             result = call(*arguments)
         except Exception as error:  # whatever the code of the task raises
-            self.wrong(method, f"{written} raises {type(error).__name__}: {error}")
-            raise _Broken from None
+            self.stop(method, f"{written} raises {type(error).__name__}: {error}")
         if not isinstance(result, kind):
-            self.wrong(method, f"{written} must return {kind.__name__}, got {type(result).__name__}")
-            raise _Broken
+            self.stop(method, f"{written} must return {kind.__name__}, got {type(result).__name__}")
         return result
 
     def wrong(self, kind: str, message: str) -> None:
         self._tell(kind, "error", message)
+
+    def stop(self, kind: str, message: str) -> NoReturn:
+        """`wrong`, and an end of the checks: the others need what is missing."""
+        self.wrong(kind, message)
+        raise _Broken
 
     def doubt(self, kind: str, message: str) -> None:
         self._tell(kind, "warning", message)

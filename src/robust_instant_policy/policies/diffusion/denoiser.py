@@ -39,7 +39,7 @@ class Denoiser(nn.Module):
     def loss(
         self, observation: Sequence[Tensor], actions: Tensor, noise_draws: int, generator: torch.Generator
     ) -> Tensor:
-        """How wrongly actions are told from noise (Ho et al. 2020, Sec. 3.2), over ``noise_draws`` an observation.
+        """Squared error of the denoised actions (Ho et al. 2020, Sec. 3.2), over ``noise_draws`` an observation.
 
         An image costs much more to encode than a sequence to denoise, so each is used several times.
         """

@@ -64,15 +64,9 @@ class ImageDiffusion:
         self._shown, self._every = demonstrations, every
         actions = [shown.trajectory.actions[_kept(len(shown.trajectory), every)] for shown in demonstrations]
         self._scaling, self._grippers = Scaling.of(np.concatenate(actions)), Grippers.of(np.concatenate(actions))
-        settings = TrainingSettings(
-            METHOD,
-            self.training.steps,
-            BATCH_SIZE,
-            NOISE_DRAWS,
-            LEARNING_RATE,
-            self.training.seed,
-            details=f"{HORIZON} actions at {self.rate_hz:g} Hz, crops of {CROP_PIXELS} of {IMAGE_PIXELS} pixels",
-        )
+        details = f"{HORIZON} actions at {self.rate_hz:g} Hz, crops of {CROP_PIXELS} of {IMAGE_PIXELS} pixels"
+        steps, seed = self.training.steps, self.training.seed
+        settings = TrainingSettings(METHOD, steps, BATCH_SIZE, NOISE_DRAWS, LEARNING_RATE, seed, details)
         width = actions[0].shape[1]
         self.trained_ = obtain(
             lambda: Denoiser(_Encoder(), HISTORY * (ImageEncoder.features + width), width),
@@ -85,13 +79,13 @@ class ImageDiffusion:
         return self
 
     def controller(self, observation: Observation) -> DiffusionController:
-        """For one episode; what it sees it is shown as it goes."""
+        """For one episode; it receives observations as the episode goes on."""
         if not hasattr(self, "trained_"):
             raise UsageError("call fit(demonstrations) before asking for a controller")
         return DiffusionController(self.trained_.model, self._scaling, self._grippers, self.rate_hz, self.training.seed)
 
     def rehearse(self, count: int) -> list[Rehearsal]:
-        """What it would do next, all along the first ``count`` demonstrations, looking wherever it would look."""
+        """The actions that it plans at each of its observations along the first ``count`` demonstrations."""
         rehearsals = []
         for demonstration in self._shown[:count]:
             actions = demonstration.trajectory.actions[_kept(len(demonstration.trajectory), self._every)]
@@ -118,7 +112,7 @@ class DiffusionController:
         self._still = 0
 
     def act(self, observation: Observation, action: FloatArray) -> FloatArray | None:
-        # Recordings hold where the hand was told to be, so that is what the model is shown; it lags a little behind.
+        # Recordings hold the commanded hand, which leads the measured one a little, so the model is shown the command.
         state = action if self._commanded is None else self._commanded
         self._seen = [*self._seen[1 - HISTORY :], self.look(small(observation.rgb), state)]
         if self._pending is not None:

@@ -5,13 +5,12 @@ The method of the paper's comparison (Di Palo and Johns 2024; Oh et al. 2025, Se
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from robust_instant_policy.context.alignment import align
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.aggregation import take_first
 from robust_instant_policy.policies.context import Context, LocatedScene
@@ -20,7 +19,7 @@ from robust_instant_policy.policies.diffusion.grippers import Grippers
 from robust_instant_policy.policies.diffusion.scaling import Scaling
 from robust_instant_policy.policies.diffusion.training import Rehearsal, Trained, TrainingSettings, known_by, obtain
 from robust_instant_policy.policies.keypoint_policy import KeypointPolicy
-from robust_instant_policy.policies.policy import Plan, Progress, Stopwatch, no_progress
+from robust_instant_policy.policies.policy import Plan, Stopwatch
 from robust_instant_policy.policies.sampling import Proposal
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.policies.training import Training
@@ -43,40 +42,28 @@ class KeypointDiffusion(KeypointPolicy):
     name = METHOD
     trained_: Trained
 
-    def __init__(
-        self,
-        settings: Settings | None = None,
-        training: Training | None = None,
-        *,
-        progress: Progress = no_progress,
-        **options: object,
-    ):
-        super().__init__(settings, progress=progress, **options)
+    def __init__(self, settings: Settings | None = None, training: Training | None = None, **options: Any):
+        super().__init__(settings, **options)
         self.training = training or Training()
 
     def fit_context(self, context: Context) -> Self:
         """Load the weights that belong to the demonstrations, or train them; returns itself."""
         super().fit_context(context)
         demonstrations = context.demonstrations
-        aligned = align(context.trajectories)
+        aligned = context.prompt.aligned
         keypoints = context.keypoints[list(aligned.kept)].reshape(len(aligned.kept), -1)
         actions = aligned.actions
         self._keypoints, self._actions = keypoints, actions
         self._inputs, self._outputs, self._grippers = Scaling.of(keypoints), Scaling.of(actions), Grippers.of(actions)
+        # the last step is repeated up to a length that the network takes
+        padding = ((0, 0), (0, -actions.shape[1] % LENGTH_MULTIPLE), (0, 0))
         data = _KeypointData(
             torch.tensor(self._inputs.scaled(keypoints), dtype=torch.float32),
             torch.tensor(KEYPOINT_NOISE_M / self._inputs.half_range, dtype=torch.float32),
-            torch.tensor(_padded(self._outputs.scaled(actions)), dtype=torch.float32),
+            torch.tensor(np.pad(self._outputs.scaled(actions), padding, mode="edge"), dtype=torch.float32),
         )
-        settings = TrainingSettings(
-            METHOD,
-            self.training.steps,
-            BATCH_SIZE,
-            NOISE_DRAWS,
-            LEARNING_RATE,
-            self.training.seed,
-            details=_described(self.settings),
-        )
+        steps, seed, details = self.training.steps, self.training.seed, _described(self.settings)
+        settings = TrainingSettings(METHOD, steps, BATCH_SIZE, NOISE_DRAWS, LEARNING_RATE, seed, details)
         self.trained_ = obtain(
             lambda: Denoiser(nn.Identity(), keypoints.shape[1], actions.shape[2]),
             lambda: data,
@@ -131,13 +118,8 @@ class _KeypointData:
         return (keypoints + noise,), self._actions[indices]
 
 
-def _padded(actions: FloatArray) -> FloatArray:
-    """``actions (I, T, D)`` with the last step repeated up to a length that the network takes."""
-    return np.pad(actions, ((0, 0), (0, -actions.shape[1] % LENGTH_MULTIPLE), (0, 0)), mode="edge")
-
-
 def _described(settings: Settings) -> str:
-    """What decides the weights beside the demonstrations; what is usual has no name, as in earlier checkpoints."""
+    """The settings that decide the weights; default values are left out, so that names of checkpoints stay the same."""
     found = {str(settings.keypoints), settings.column} - {Settings().keypoints, Settings().column}
     return (
         f"{settings.num_keypoints} keypoints by {' '.join((settings.features, *sorted(found)))}, "

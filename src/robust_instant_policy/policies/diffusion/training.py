@@ -1,4 +1,4 @@
-"""Training that can be killed at any moment and goes on, to the bit, where it was."""
+"""Training that can be stopped at any moment and resumed with the same result, to the bit."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ class Trained:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsal:
-    """What a policy samples where it was shown what to do: ``samples (Q, T, D)`` beside ``shown (T, D)``."""
+    """What a policy samples in the scene of a demonstration: ``samples (Q, T, D)`` beside the ``shown (T, D)``."""
 
     shown: FloatArray
     samples: FloatArray
 
 
 class TrainedPolicy(Protocol):
-    """A policy that was fitted by training, and can say what it would do where it was shown what to do."""
+    """A policy that was fitted by training, and can sample in the scenes of its demonstrations."""
 
     trained_: Trained
 

@@ -1,7 +1,7 @@
 """The denoising network of Diffusion Policy, CNN version (Chi et al. 2023, Sec. III-B).
 
-A 1-D U-Net over time whose every block is told, by feature-wise modulation (Perez et al. 2018), the diffusion step and
-what was observed.
+A 1-D U-Net over time. Every block gets the diffusion step and the observation by feature-wise modulation (Perez et al.
+2018).
 """
 
 from __future__ import annotations

@@ -27,7 +27,6 @@ from robust_instant_policy.tasks.aloha.robot import (
     HOME_JOINTS,
     PARKED_JOINTS,
     TOOL,
-    site_pose,
     two_arms,
 )
 from robust_instant_policy.tasks.aloha.surfaces import (
@@ -42,6 +41,7 @@ from robust_instant_policy.tasks.aloha.surfaces import (
     tube,
 )
 from robust_instant_policy.tasks.level import PAPER, Distractor, Furnishing, Layout, Level, Region, Rod
+from robust_instant_policy.tasks.mujoco_images import MujocoImages, pinhole
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.textures import laminate, wood
 
@@ -52,10 +52,10 @@ SETTLE_SECONDS = 0.4  # for objects to come to rest before the image
 # Intel RealSense D415 at 640x480: the sides of the 65 x 40 degrees are cropped, the height is kept.
 CAMERA_HEIGHT_M = 0.85
 CAMERA_X_M = -0.05
-CAMERA_WIDTH, CAMERA_HEIGHT = 640, 480
+CAMERA_SIZE = CAMERA_WIDTH, CAMERA_HEIGHT = (640, 480)
 CAMERA_FOV_DEG = 40.0  # vertical
 DEPTH_UNIT_M = 0.001
-VIDEO_WIDTH, VIDEO_HEIGHT = 480, 360
+VIDEO_SIZE = VIDEO_WIDTH, VIDEO_HEIGHT = (480, 360)
 
 TABLE_SIZE_M = (1.22, 0.76, 0.04)  # the table top of gym-aloha
 TABLE_FRICTION = 0.6
@@ -106,7 +106,6 @@ class AlohaEnv(gymnasium.Env):
             seen["rgb"] = gymnasium.spaces.Box(0, 255, (*shape, 3), np.uint8)
             seen["depth"] = gymnasium.spaces.Box(0.0, FAR_M, shape, np.float32)
         self.observation_space = gymnasium.spaces.Dict(seen)
-        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         self._seed = 0
 
     def build(self, spec: mujoco.MjSpec) -> None:
@@ -128,7 +127,7 @@ class AlohaEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         super().reset(seed=seed)
         self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._close_renderers()
+        self.close()
         self.layout = Layout(self.level, self._seed, REGION)
         spec = two_arms()
         _furnish(spec, self.layout.furnishing())
@@ -141,6 +140,7 @@ class AlohaEnv(gymnasium.Env):
             _add_rod(spec, rod)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
+        self._images = MujocoImages(self.model, self.data)
         home = dict(
             zip(self.end_effectors, self.layout.home(np.array([HOME_JOINTS] * len(self.end_effectors))), strict=True)
         )
@@ -155,7 +155,7 @@ class AlohaEnv(gymnasium.Env):
             self.data.actuator(f"{arm}/{FINGERS[0]}").ctrl = CLOSED_M + travel
         mujoco.mj_step(self.model, self.data, round(SETTLE_SECONDS / TIMESTEP_S))
         mujoco.mj_forward(self.model, self.data)
-        self._joints_before = self._joints()
+        self._joints_before = self.measured()
         return self._observation(), {}
 
     def step(self, action: FloatArray) -> tuple[dict, float, bool, bool, dict]:
@@ -165,7 +165,7 @@ class AlohaEnv(gymnasium.Env):
 
     def advance(self, command: FloatArray) -> None:
         """One control step, with joint angles and finger travel ``(7·A,)`` commanded, without evaluation."""
-        self._joints_before = self._joints()
+        self._joints_before = self.measured()
         for side, (*angles, travel) in zip(self.end_effectors, command.reshape(-1, len(ARM_JOINTS) + 1), strict=True):
             for joint, angle in zip(ARM_JOINTS, angles, strict=True):
                 self.data.actuator(f"{ARMS[side]}/{joint}").ctrl = angle
@@ -174,51 +174,39 @@ class AlohaEnv(gymnasium.Env):
 
     def photograph(self) -> Observation:
         """The current image of the camera above the table."""
-        renderer = self._renderer(CAMERA_WIDTH, CAMERA_HEIGHT)
-        renderer.update_scene(self.data, "top")
-        rgb = renderer.render()
-        renderer.enable_depth_rendering()
-        depth = renderer.render()
-        renderer.disable_depth_rendering()
-        focal = CAMERA_HEIGHT / 2 / np.tan(np.deg2rad(CAMERA_FOV_DEG) / 2)
-        intrinsics = [[focal, 0, (CAMERA_WIDTH - 1) / 2], [0, focal, (CAMERA_HEIGHT - 1) / 2], [0, 0, 1]]
+        depth = self._images.depth("top", CAMERA_SIZE)
         axes = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
         return Observation(
-            rgb=rgb,
+            rgb=self._images.rgb("top", CAMERA_SIZE),
             depth=(np.rint(depth.astype(np.float64) / DEPTH_UNIT_M) * DEPTH_UNIT_M).astype(np.float32),
-            intrinsics=np.array(intrinsics),
+            intrinsics=pinhole(CAMERA_SIZE, CAMERA_FOV_DEG),
             camera_pose=make_pose(axes.T, (CAMERA_X_M, 0.0, CAMERA_HEIGHT_M)),
         )
 
     def scene_truth(self) -> SceneTruth:
         """Ground truth of each pixel of the top view."""
-        renderer = self._renderer(CAMERA_WIDTH, CAMERA_HEIGHT)
-        renderer.update_scene(self.data, "top")
-        renderer.enable_segmentation_rendering()
-        seen = renderer.render()
-        renderer.disable_segmentation_rendering()
+        seen = self._images.segmentation("top", CAMERA_SIZE)
         parts = np.full(seen.shape[:2], -1)
         geoms = seen[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
         parts[geoms] = self.model.geom_bodyid[seen[..., 0][geoms]]
-        bodies = range(self.model.nbody)
-        poses = [make_pose(self.data.xmat[body].reshape(3, 3), self.data.xpos[body]) for body in bodies]
-        return SceneTruth(parts, tuple(self.model.body(body).name for body in bodies), np.array(poses))
+        names = tuple(self.model.body(body).name for body in range(self.model.nbody))
+        return SceneTruth(parts, names, make_pose(self.data.xmat.reshape(-1, 3, 3), self.data.xpos))
 
     def video_frame(self) -> np.ndarray:
         """RGB frame ``(H, W, 3)`` uint8 of the camera beside the table."""
-        renderer = self._renderer(VIDEO_WIDTH, VIDEO_HEIGHT)
-        renderer.update_scene(self.data, "side")
-        return renderer.render()
+        return self._images.rgb("side", VIDEO_SIZE)
 
     def render(self) -> np.ndarray | None:
         return self.video_frame() if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        self._close_renderers()
+        if hasattr(self, "_images"):
+            self._images.close()
 
     def tool_poses(self) -> FloatArray:
         """Poses of the working arms' tool frames, ``(A, 4, 4)``."""
-        return np.stack([site_pose(self.data, f"{ARMS[side]}/{TOOL}") for side in self.end_effectors])
+        tools = [self.data.site(f"{ARMS[side]}/{TOOL}") for side in self.end_effectors]
+        return np.stack([make_pose(tool.xmat.reshape(3, 3), tool.xpos) for tool in tools])
 
     def pose_of(self, body: str) -> FloatArray:
         """Pose of a body, ``(4, 4)``."""
@@ -227,7 +215,7 @@ class AlohaEnv(gymnasium.Env):
 
     def arm_is_still(self) -> bool:
         """Whether no joint of a working arm moved faster than `STILL_RAD_S` over the last control step."""
-        moved = np.abs(self._joints() - self._joints_before).reshape(-1, len(ARM_JOINTS) + 1)[:, : len(ARM_JOINTS)]
+        moved = np.abs(self.measured() - self._joints_before).reshape(-1, len(ARM_JOINTS) + 1)[:, : len(ARM_JOINTS)]
         return bool(moved.max() * CONTROL_HZ <= STILL_RAD_S)
 
     def is_still(self, body: str) -> bool:
@@ -248,16 +236,12 @@ class AlohaEnv(gymnasium.Env):
         """Whether both fingers of the arm on a ``side`` press on a body."""
         return all(self.touch(body, f"{ARMS[side]}/{finger}_link") > HELD_N for finger in FINGERS)
 
-    def measured(self) -> FloatArray:
-        """Joint angles and finger travel of the working arms, ``(7·A,)``."""
-        return self._joints()
-
     def grip_loads(self) -> FloatArray:
         """Force of each working gripper as a share of its limit, ``(A,)``."""
         forces = [self.data.actuator(f"{ARMS[side]}/{FINGERS[0]}").force[0] for side in self.end_effectors]
         return np.abs(forces) / (2 * GRIP_FORCE_N)
 
-    def _joints(self) -> FloatArray:
+    def measured(self) -> FloatArray:
         """Joint angles and finger travel of the working arms, in the order of commands ``(7·A,)``."""
         reached: list[float] = []
         for side in self.end_effectors:
@@ -266,21 +250,11 @@ class AlohaEnv(gymnasium.Env):
         return np.array(reached)
 
     def _observation(self) -> dict[str, np.ndarray]:
-        seen: dict[str, np.ndarray] = {"joints": self._joints().astype(np.float32)}
+        seen: dict[str, np.ndarray] = {"joints": self.measured().astype(np.float32)}
         if self.obs_mode == "rgbd":
             photograph = self.photograph()
             seen |= {"rgb": photograph.rgb, "depth": photograph.depth}
         return seen
-
-    def _renderer(self, width: int, height: int) -> mujoco.Renderer:
-        if (width, height) not in self._renderers:
-            self._renderers[width, height] = mujoco.Renderer(self.model, height, width)
-        return self._renderers[width, height]
-
-    def _close_renderers(self) -> None:
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers.clear()
 
 
 def _joint_ranges() -> FloatArray:

@@ -8,15 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.tasks.aloha.surfaces import (
-    Body,
-    add_hull,
-    add_surface,
-    free_body,
-    paint,
-    revolved,
-)
+from robust_instant_policy.geometry import FloatArray, make_pose
+from robust_instant_policy.tasks.aloha.surfaces import Body, add_hull, add_surface, free_body, paint, revolved
 from robust_instant_policy.tasks.textures import Color
 
 MASS_KG = 0.13
@@ -64,10 +57,7 @@ class Cup:
         side = np.array([0.0, 1.0, 0.0])
         up = np.cross(axis, side)
         rotation = np.stack([np.cos(turn) * side + np.sin(turn) * up, np.cos(turn) * up - np.sin(turn) * side, axis], 1)
-        pose = np.eye(4)
-        pose[:3, :3] = rotation
-        pose[:3, 3] = -self.height / 2 * np.array([np.cos(tilt), 0, 0]) + np.array([0, 0, lowest * np.cos(tilt)])
-        return pose
+        return make_pose(rotation, [-self.height / 2 * np.cos(tilt), 0, lowest * np.cos(tilt)])
 
     def build(self, spec: mujoco.MjSpec, name: str, pose: FloatArray) -> Body:
         """Add the cup to ``spec`` at ``pose (4, 4)``."""

@@ -79,6 +79,5 @@ SPEC = TaskSpec(
     name="aloha-cup-upright",
     description="stand the lying cup upright",
     goal="the cup stands upright on the table",
-    env_id="RIP-AlohaCupUpright-v1",
     expert=stand_up,
 )

@@ -93,6 +93,5 @@ SPEC = TaskSpec(
     name="aloha-hang",
     description="hang the clothes hanger on the rod",
     goal="the hanger hangs on the rod",
-    env_id="RIP-AlohaHang-v1",
     expert=hang,
 )

@@ -62,6 +62,5 @@ SPEC = TaskSpec(
     name="aloha-pick-banana",
     description="pick the banana from the table",
     goal="the banana is held above the table",
-    env_id="RIP-AlohaPickBanana-v1",
     expert=pick,
 )

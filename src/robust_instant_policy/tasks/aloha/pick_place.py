@@ -82,7 +82,6 @@ SPEC = TaskSpec(
     name="aloha-pick-place",
     description="put the bottle into the red bowl",
     goal="the bottle is in the red bowl",
-    env_id="RIP-AlohaPickPlace-v1",
     expert=pick_and_place,
     object_sets=("seen", "unseen"),
 )

@@ -13,7 +13,7 @@ import gym_aloha
 import mujoco
 import numpy as np
 
-from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pose
+from robust_instant_policy.geometry import GripperTriangle
 from robust_instant_policy.motion.arm import Arm
 from robust_instant_policy.motion.kinematics import Kinematics
 
@@ -161,9 +161,3 @@ def viperx(side: str) -> Arm:
         tool_speed=TOOL_SPEED_LIMIT_M_S,
         turn_tolerance=TURN_TOLERANCE_RAD,
     )
-
-
-def site_pose(data: mujoco.MjData, name: str) -> FloatArray:
-    """World pose ``(4, 4)`` of a site."""
-    site = data.site(name)
-    return make_pose(site.xmat.reshape(3, 3), site.xpos)

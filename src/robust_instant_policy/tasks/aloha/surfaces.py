@@ -35,7 +35,6 @@ def revolved(profile: ArrayLike, sides: int = 48, flat: bool = False) -> Surface
     ``flat`` keeps its ``sides`` as facets with an edge between them.
     """
     profile = np.asarray(profile, dtype=np.float64)
-    count = len(profile)
     angles = np.linspace(0.0, 2 * np.pi, sides + 1)
     if flat:
         angles = np.repeat(angles, 2)[1:-1]
@@ -43,21 +42,12 @@ def revolved(profile: ArrayLike, sides: int = 48, flat: bool = False) -> Surface
     vertices = np.concatenate(
         [
             profile[None, :, :1] * ring[:, None],
-            np.broadcast_to(profile[None, :, 1:], (len(ring), count, 1)),
+            np.broadcast_to(profile[None, :, 1:], (len(ring), len(profile), 1)),
         ],
         axis=2,
     )
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
-    uvs = np.stack(np.meshgrid(angles / (2 * np.pi), along / along[-1], indexing="ij"), axis=-1)
-    starts = np.arange(0, len(ring) - 1, 2 if flat else 1)
-    first = (starts[:, None] * count + np.arange(count - 1)).ravel()
-    faces = np.concatenate(
-        [
-            np.stack([first, first + count, first + count + 1], axis=1),
-            np.stack([first, first + count + 1, first + 1], axis=1),
-        ]
-    )
-    return Surface(vertices.reshape(-1, 3), faces, uvs.reshape(-1, 2))
+    return _sheet(vertices, angles / (2 * np.pi), along / along[-1], every=2 if flat else 1)
 
 
 def box_surface(size: ArrayLike) -> Surface:
@@ -95,10 +85,10 @@ def tube(points: ArrayLike, radius: float, sides: int = 14) -> Surface:
     return _sheet(rows, np.linspace(0.0, 1.0, sides + 1), np.linspace(0.0, 1.0, rows.shape[1]))
 
 
-def _sheet(rows: FloatArray, u: FloatArray, v: FloatArray) -> Surface:
-    """Triangles between neighbours of a grid of points ``rows (U, V, 3)``."""
+def _sheet(rows: FloatArray, u: FloatArray, v: FloatArray, every: int = 1) -> Surface:
+    """Triangles between a grid of points ``rows (U, V, 3)``: from ``every`` such row to the next one."""
     count = rows.shape[1]
-    first = (np.arange(len(rows) - 1)[:, None] * count + np.arange(count - 1)).ravel()
+    first = (np.arange(0, len(rows) - 1, every)[:, None] * count + np.arange(count - 1)).ravel()
     faces = np.concatenate(
         [
             np.stack([first, first + count, first + count + 1], axis=1),

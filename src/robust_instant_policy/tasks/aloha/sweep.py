@@ -135,7 +135,6 @@ SPEC = TaskSpec(
     name="aloha-sweep",
     description="sweep the object into the dustpan with the brush",
     goal="the object is in the dustpan",
-    env_id="RIP-AlohaSweep-v1",
     expert=sweep,
     object_sets=("seen", "unseen"),
 )

@@ -46,11 +46,6 @@ def corners(x: float, y: float) -> FloatArray:
     return np.array([(side * x / 2, other * y / 2) for side in (-1, 1) for other in (-1, 1)])
 
 
-def pose_of(actor: Actor) -> FloatArray:
-    """Pose ``(4, 4)`` of an actor in the world."""
-    return actor.pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)
-
-
 def is_still(actor: Actor, limit_m_s: float = 0.01, limit_rad_s: float = 0.2) -> bool:
     return bool(actor.is_static(lin_thresh=limit_m_s, ang_thresh=limit_rad_s))
 

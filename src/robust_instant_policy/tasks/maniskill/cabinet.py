@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import sapien
 
-from robust_instant_policy.tasks.maniskill.carpentry import add_box, add_cylinder, hinge
-from robust_instant_policy.tasks.maniskill.mechanism import ON_THE_SPOT, Door, Mechanism, resist
+from robust_instant_policy.tasks.maniskill.carpentry import Joint, add_box, add_cylinder, build_mechanism
+from robust_instant_policy.tasks.maniskill.mechanism import Door, Mechanism
 from robust_instant_policy.tasks.maniskill.paint import BLACK, STEEL, WHITE, Paint
 
 BOARD_M = 0.012
@@ -83,19 +82,9 @@ class Cabinet:
         return Door(hinge_at, HINGE_SIDE, self.door_width, self.door_top)
 
     def build(self, scene: Any) -> Mechanism:
-        builder = scene.create_articulation_builder()
-        body = builder.create_link_builder()
-        body.set_name("body")
-        self._build_body(body)
-        door = builder.create_link_builder(body)
-        door.set_name("door")
-        door.set_joint_name("hinge")
-        hinge(door, "revolute", (*self.door_geometry.hinge, 0.0), (0.0, 0.0, -HINGE_SIDE), (0.0, DOOR_LIMIT_RAD))
-        self._build_door(door)
-        builder.initial_pose = sapien.Pose([0.2, 0, 0])
-        cabinet = builder.build(name="cabinet", fix_root_link=True)
-        resist(cabinet, "hinge", HINGE_DAMPING, HINGE_FRICTION)
-        return Mechanism(cabinet, "hinge", "door", ON_THE_SPOT)
+        at, axis = (*self.door_geometry.hinge, 0.0), (0.0, 0.0, -HINGE_SIDE)
+        hinge = Joint("hinge", "revolute", at, axis, DOOR_LIMIT_RAD, HINGE_DAMPING, HINGE_FRICTION)
+        return build_mechanism(scene, "cabinet", self._build_body, "door", self._build_door, hinge)
 
     def _build_body(self, link: Any) -> None:
         width, depth, height = self.width, self.depth, self.height

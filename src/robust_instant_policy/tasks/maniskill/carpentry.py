@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,7 @@ import sapien
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from robust_instant_policy.tasks.maniskill.mechanism import Mechanism, resist
 from robust_instant_policy.tasks.maniskill.paint import Paint
 
 AXES = {"x": (1.0, 0.0, 0.0, 0.0), "y": (0.70710678, 0.0, 0.0, 0.70710678), "z": (0.70710678, 0.0, -0.70710678, 0.0)}
@@ -48,13 +51,40 @@ def add_ball(builder: Any, radius: float, centre: ArrayLike, paint: Paint) -> No
     builder.add_sphere_collision(sapien.Pose(centre), radius, density=WOOD_DENSITY)
 
 
-def hinge(builder: Any, kind: str, at: ArrayLike, axis: ArrayLike, limits: tuple[float, float]) -> None:
-    """Join the link to its parent: ``kind`` ``"revolute"`` about, or ``"prismatic"`` along, ``axis (3,)`` at ``at``.
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint at ``at (3,)`` that turns its link about ``axis (3,)`` (``kind`` "revolute") or moves it along it
+    ("prismatic"), from 0 to ``limit`` rad or metres, against viscous ``damping`` (N m s/rad or N s/m) and PhysX's
+    coefficient of ``friction``."""
 
-    The link's own frame is that of its parent moved to ``at (3,)``.
-    """
-    turn = _turn_x_to(np.asarray(axis, dtype=np.float64))
-    builder.set_joint_properties(kind, [list(limits)], sapien.Pose(at, turn), sapien.Pose([0, 0, 0], turn))
+    name: str
+    kind: str
+    at: ArrayLike
+    axis: ArrayLike
+    limit: float
+    damping: float
+    friction: float
+
+
+def build_mechanism(
+    scene: Any, name: str, build_body: Callable[[Any], None], part: str, build_part: Callable[[Any], None], joint: Joint
+) -> Mechanism:
+    """An object of a fixed body and one ``part`` on a ``joint``; the part's frame is the body's moved to the joint."""
+    builder = scene.create_articulation_builder()
+    body = builder.create_link_builder()
+    body.set_name("body")
+    build_body(body)
+    link = builder.create_link_builder(body)
+    link.set_name(part)
+    link.set_joint_name(joint.name)
+    turn = _turn_x_to(np.asarray(joint.axis, dtype=np.float64))
+    poses = sapien.Pose(joint.at, turn), sapien.Pose([0, 0, 0], turn)
+    link.set_joint_properties(joint.kind, [[0.0, joint.limit]], *poses)
+    build_part(link)
+    builder.initial_pose = sapien.Pose([0.2, 0, 0])
+    articulation = builder.build(name=name, fix_root_link=True)
+    resist(articulation, joint.name, joint.damping, joint.friction)
+    return Mechanism(articulation, joint.name, part, np.eye(4))
 
 
 def _turn_x_to(direction: np.ndarray) -> list[float]:

@@ -100,6 +100,7 @@ class CellEnv(BaseEnv):
             add_box(builder, (1.2, 1.6, MAT_M), (0.1, 0, MAT_M / 2), paint, collide=False)
             builder.initial_pose = sapien.Pose()
             builder.build_static(name="mat")
+        self.build_objects()
 
     def _load_lighting(self, options: dict) -> None:
         # Slanted, so that flat metal does not reflect a lamp into the camera. No shadows: on the CPU they would take
@@ -130,6 +131,10 @@ class CellEnv(BaseEnv):
             add_cylinder(builder, rod.radius, length, middle, along, BLACK, collide=False)
             builder.initial_pose = sapien.Pose()
             builder.build_static(name="rod")
+
+    def build_objects(self) -> None:
+        """Add the objects of the episode to the scene."""
+        raise NotImplementedError
 
     def place_objects(self) -> None:
         """Put the objects of the episode where they are, each by `Layout.place`."""

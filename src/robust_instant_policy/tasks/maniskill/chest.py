@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import sapien
 
-from robust_instant_policy.tasks.maniskill.carpentry import add_box, add_cylinder, hinge
-from robust_instant_policy.tasks.maniskill.mechanism import ON_THE_SPOT, Drawer, Mechanism, resist
+from robust_instant_policy.tasks.maniskill.carpentry import Joint, add_box, add_cylinder, build_mechanism
+from robust_instant_policy.tasks.maniskill.mechanism import Drawer, Mechanism
 from robust_instant_policy.tasks.maniskill.paint import BLACK, STEEL, WHITE, Paint
 
 BOARD_M = 0.01
@@ -74,19 +73,9 @@ class Chest:
         return Drawer(np.array([-GRASP_REACH_M, 0.0, self.handle_height]), self.travel)
 
     def build(self, scene: Any) -> Mechanism:
-        builder = scene.create_articulation_builder()
-        body = builder.create_link_builder()
-        body.set_name("body")
-        self._build_body(body)
-        drawer = builder.create_link_builder(body)
-        drawer.set_name("drawer")
-        drawer.set_joint_name("slide")
-        hinge(drawer, "prismatic", (0.0, 0.0, self.handle_height), (-1.0, 0.0, 0.0), (0.0, self.travel))
-        self._build_drawer(drawer)
-        builder.initial_pose = sapien.Pose([0.2, 0, 0])
-        chest = builder.build(name="chest", fix_root_link=True)
-        resist(chest, "slide", SLIDE_DAMPING, SLIDE_FRICTION)
-        return Mechanism(chest, "slide", "drawer", ON_THE_SPOT)
+        at, axis = (0.0, 0.0, self.handle_height), (-1.0, 0.0, 0.0)
+        slide = Joint("slide", "prismatic", at, axis, self.travel, SLIDE_DAMPING, SLIDE_FRICTION)
+        return build_mechanism(scene, "chest", self._build_body, "drawer", self._build_drawer, slide)
 
     def _build_body(self, link: Any) -> None:
         width, depth, height = self.width, self.depth, self.height

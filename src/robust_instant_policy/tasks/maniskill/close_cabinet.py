@@ -39,8 +39,7 @@ class CloseCabinetEnv(CellEnv):
     door: Door
     cabinet: Mechanism
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         rng = self.draw("shape")
         if self.assets == "maniskill":
             self.cabinet, self.door = partnet.load_cabinet(self.scene, self.objects, rng)
@@ -95,7 +94,6 @@ SPEC = TaskSpec(
     name="close-cabinet",
     description="push the cabinet's door closed",
     goal="the cabinet's door is closed",
-    env_id="RIP-CloseCabinet-v1",
     expert=push_closed,
     object_sets=("seen", "unseen"),
     asset_sources=("code", "maniskill"),

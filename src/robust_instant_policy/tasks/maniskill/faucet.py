@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import sapien
 
-from robust_instant_policy.tasks.maniskill.carpentry import add_ball, add_box, add_cylinder, hinge
-from robust_instant_policy.tasks.maniskill.mechanism import ON_THE_SPOT, Lever, Mechanism, resist
+from robust_instant_policy.tasks.maniskill.carpentry import Joint, add_ball, add_box, add_cylinder, build_mechanism
+from robust_instant_policy.tasks.maniskill.mechanism import Lever, Mechanism
 from robust_instant_policy.tasks.maniskill.paint import BLACK, BRASS, RED, STEEL, WHITE, Paint
 
 LEVER_GAP_M = 0.003
@@ -82,19 +81,9 @@ class Faucet:
         )
 
     def build(self, scene: Any) -> Mechanism:
-        builder = scene.create_articulation_builder()
-        body = builder.create_link_builder()
-        body.set_name("body")
-        self._build_body(body)
-        lever = builder.create_link_builder(body)
-        lever.set_name("lever")
-        lever.set_joint_name("valve")
-        hinge(lever, "revolute", (0, 0, self.lever_height), (0, 0, -1), (0.0, self.turn))
-        self._build_lever(lever)
-        builder.initial_pose = sapien.Pose([0.1, 0, 0])
-        faucet = builder.build(name="faucet", fix_root_link=True)
-        resist(faucet, "valve", LEVER_DAMPING, LEVER_FRICTION)
-        return Mechanism(faucet, "valve", "lever", ON_THE_SPOT)
+        at, axis = (0, 0, self.lever_height), (0, 0, -1)
+        valve = Joint("valve", "revolute", at, axis, self.turn, LEVER_DAMPING, LEVER_FRICTION)
+        return build_mechanism(scene, "faucet", self._build_body, "lever", self._build_lever, valve)
 
     def _build_body(self, link: Any) -> None:
         spout_height = 0.72 * self.height

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import sapien
 import torch
 from mani_skill.utils.structs.articulation import Articulation
@@ -106,6 +105,3 @@ def resist(articulation: Articulation, joint: str, damping: float, friction: flo
     moving = articulation.joints_map[joint]
     moving.set_drive_properties(0.0, damping)
     moving.set_friction(friction)
-
-
-ON_THE_SPOT = np.eye(4)

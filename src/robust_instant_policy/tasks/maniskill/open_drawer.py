@@ -33,8 +33,7 @@ class OpenDrawerEnv(CellEnv):
     drawer: Drawer
     chest: Mechanism
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         if self.assets == "maniskill":
             self.chest, self.drawer = partnet.load_chest(self.scene, self.draw("shape"))
         else:
@@ -73,7 +72,6 @@ SPEC = TaskSpec(
     name="open-drawer",
     description="pull the drawer open by its handle",
     goal="the drawer is open",
-    env_id="RIP-OpenDrawer-v1",
     expert=pull,
     asset_sources=("code", "maniskill"),
 )

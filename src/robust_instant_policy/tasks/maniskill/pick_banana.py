@@ -18,6 +18,7 @@ from robust_instant_policy.geometry import FloatArray, invert_pose
 from robust_instant_policy.tasks.banana import Banana
 from robust_instant_policy.tasks.demonstrator import Stroke
 from robust_instant_policy.tasks.maniskill import partnet
+from robust_instant_policy.tasks.maniskill.camera import matrix
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.paint import texture
 from robust_instant_policy.tasks.picking import Pick, failure_of_pick
@@ -45,8 +46,7 @@ class PickBananaEnv(CellEnv):
     lie: FloatArray  # the frame of `Banana` in the actor's frame
     rest_height: float  # of the banana's middle over the table
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         if self.assets == "maniskill":
             partnet.require_banana()
             builder = actors.get_actor_builder(self.scene, id=f"ycb:{partnet.YCB_BANANA}")
@@ -69,7 +69,7 @@ class PickBananaEnv(CellEnv):
 
     def middle(self) -> FloatArray:
         """The banana's frame ``(4, 4)`` in the world: its middle, x along the fruit."""
-        return self.banana.pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64) @ self.lie
+        return matrix(self.banana.pose) @ self.lie
 
     def failure(self) -> str:
         lifted = bool(self.middle()[2, 3] > self.rest_height + LIFTED_M)
@@ -101,7 +101,6 @@ SPEC = TaskSpec(
     name="pick-banana",
     description="pick the banana from the table",
     goal="the banana is held above the table",
-    env_id="RIP-PickBanana-v1",
     expert=pick,
     asset_sources=("code", "maniskill"),
 )

@@ -40,8 +40,7 @@ class PushCubeEnv(CellEnv):
     push_pose: FloatArray
     distance: float
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         self.cube = actors.build_cube(
             self.scene,
             half_size=CUBE_HALF_SIZE_M,
@@ -106,6 +105,5 @@ SPEC = TaskSpec(
     name="push-cube",
     description="push the cube into the goal disc",
     goal="the cube is in the goal disc",
-    env_id="RIP-PushCube-v1",
     expert=push,
 )

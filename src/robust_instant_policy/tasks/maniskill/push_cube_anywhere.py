@@ -33,6 +33,5 @@ SPEC = replace(
     PUSH_CUBE,
     name="push-cube-anywhere",
     description="push the cube into the goal disc, wherever it lies",
-    env_id="RIP-PushCubeAnywhere-v1",
     object_sets=("seen", "unseen"),
 )

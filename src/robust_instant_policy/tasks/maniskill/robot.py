@@ -12,8 +12,8 @@ from typing import ClassVar
 import numpy as np
 import sapien
 import torch
-from mani_skill.agents.base_agent import BaseAgent, Keyframe
-from mani_skill.agents.controllers import PDJointPosControllerConfig, PDJointPosMimicControllerConfig, deepcopy_dict
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers import PDJointPosControllerConfig, PDJointPosMimicControllerConfig
 from mani_skill.agents.registration import register_agent
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.building.articulation_builder import ArticulationBuilder
@@ -63,20 +63,17 @@ class UR5eHandE(BaseAgent):
     )
     disable_self_collisions = True
     _description: ClassVar[ArticulationBuilder | None] = None
-    keyframes: ClassVar[dict] = dict(
-        rest=Keyframe(
-            pose=None,
-            qpos=np.array([0.0, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0.0, FINGER_TRAVEL_M, FINGER_TRAVEL_M]),
-        )
-    )
 
     @property
     def _controller_configs(self):
-        arm = dict(
-            joint_names=list(ARM_JOINTS),
+        arm = PDJointPosControllerConfig(
+            list(ARM_JOINTS),
+            lower=None,
+            upper=None,
             stiffness=list(ARM_STIFFNESS),
             damping=[DRIVE_LAG_S * stiffness for stiffness in ARM_STIFFNESS],
             force_limit=list(ARM_TORQUE_NM),
+            normalize_action=False,
         )
         hand = PDJointPosMimicControllerConfig(
             list(FINGER_JOINTS),
@@ -88,17 +85,7 @@ class UR5eHandE(BaseAgent):
             normalize_action=False,
             mimic={"right_finger": {"joint": "left_finger"}},
         )
-        return deepcopy_dict(
-            dict(
-                pd_joint_pos=dict(
-                    arm=PDJointPosControllerConfig(lower=None, upper=None, normalize_action=False, **arm), hand=hand
-                ),
-                pd_joint_delta_pos=dict(
-                    arm=PDJointPosControllerConfig(lower=-0.05, upper=0.05, use_delta=True, use_target=True, **arm),
-                    hand=hand,
-                ),
-            )
-        )
+        return dict(pd_joint_pos=dict(arm=arm, hand=hand))
 
     def _load_articulation(self, initial_pose: sapien.Pose | None = None) -> None:
         # As in the base class, but the description is read once per process, not per scene.

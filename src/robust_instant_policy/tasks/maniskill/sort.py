@@ -9,7 +9,8 @@ from mani_skill.utils.structs.actor import Actor
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.tasks.demonstrator import Stroke
-from robust_instant_policy.tasks.maniskill.block import Block, apart, corners, is_still, pose_of, scattered
+from robust_instant_policy.tasks.maniskill.block import Block, apart, corners, is_still, scattered
+from robust_instant_policy.tasks.maniskill.camera import matrix
 from robust_instant_policy.tasks.maniskill.carpentry import add_box
 from robust_instant_policy.tasks.maniskill.cell import BASE_POSITION_M, CellEnv
 from robust_instant_policy.tasks.maniskill.paint import BLACK, BRASS, RED, STEEL, WHITE, Paint
@@ -39,8 +40,7 @@ class SortEnv(CellEnv):
     blocks: tuple[Actor, Actor]
     nearer: int
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         *paints, mark = PAINTS[self.objects]
         first, second = (Block(SIZE_M[self.objects], paint, (mark,)) for paint in paints)
         self.blocks = first.build(self.scene, "first block"), second.build(self.scene, "second block")
@@ -72,7 +72,7 @@ class SortEnv(CellEnv):
         if _is_in_tray(other):
             return "the block further away is in the tray"
         if not _is_in_tray(nearer):
-            away = np.linalg.norm(pose_of(nearer)[:2, 3] - TRAY_M)
+            away = np.linalg.norm(matrix(nearer.pose)[:2, 3] - TRAY_M)
             return f"the nearer block is {1e3 * away:.0f} mm from the tray's middle, not in it"
         return "" if is_still(nearer) else "the nearer block is in the tray but still moving"
 
@@ -89,7 +89,7 @@ def _build_tray(scene: object) -> Actor:
 
 
 def _is_in_tray(block: Actor) -> bool:
-    x, y, z = pose_of(block)[:3, 3] - [*TRAY_M, 0.0]
+    x, y, z = matrix(block.pose)[:3, 3] - [*TRAY_M, 0.0]
     return max(abs(x), abs(y)) < TRAY_SIZE_M[0] / 2 and z < TRAY_SIZE_M[2]
 
 
@@ -97,14 +97,13 @@ def sort(env: SortEnv, rng: np.random.Generator) -> list[Stroke]:
     """Grasp the nearer block, carry it over the tray, and let go near its floor."""
     tray = facing(*TRAY_M, 0.0)
     tray[2, 3] = FLOOR_M + RELEASE_M
-    return [*PICK.strokes(pose_of(env.blocks[env.nearer]), rng), *set_down(tray, PICK)]
+    return [*PICK.strokes(matrix(env.blocks[env.nearer].pose), rng), *set_down(tray, PICK)]
 
 
 SPEC = TaskSpec(
     name="sort",
     description="put the block that is nearer to the robot into the tray",
     goal="the nearer block is in the tray",
-    env_id="RIP-Sort-v1",
     expert=sort,
     object_sets=("seen", "unseen"),
 )

@@ -8,7 +8,8 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs.actor import Actor
 
 from robust_instant_policy.tasks.demonstrator import Stroke
-from robust_instant_policy.tasks.maniskill.block import Block, apart, corners, is_still, pose_of, scattered
+from robust_instant_policy.tasks.maniskill.block import Block, apart, corners, is_still, scattered
+from robust_instant_policy.tasks.maniskill.camera import matrix
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.paint import BLACK, BRASS, RED, WHITE, Paint
 from robust_instant_policy.tasks.picking import Pick, set_down
@@ -38,8 +39,7 @@ class StackEnv(CellEnv):
     base: Actor
     base_edge: float
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         self.base_edge = float(self.draw("shape").uniform(*BASE_EDGES_M))
         paint, base_paint, mark = PAINTS[self.objects]
         self.cube = Block((EDGE_M,) * 3, paint, (mark,)).build(self.scene, "cube")
@@ -55,7 +55,7 @@ class StackEnv(CellEnv):
     def failure(self) -> str:
         if self.agent.is_grasping(self.cube):
             return "the cube is still in the fingers"
-        x, y, z = (pose_of(self.cube) - pose_of(self.base))[:3, 3]
+        x, y, z = (matrix(self.cube.pose) - matrix(self.base.pose))[:3, 3]
         offset = float(np.hypot(x, y))
         if abs(z - self.base_edge) > HEIGHT_TOLERANCE_M:
             return f"the cube's foot is {1e3 * z:.0f} mm above the base's, {1e3 * self.base_edge:.0f} mm wanted"
@@ -66,16 +66,15 @@ class StackEnv(CellEnv):
 
 def stack(env: StackEnv, rng: np.random.Generator) -> list[Stroke]:
     """Grasp the cube, carry it over the base, set it down turned like the base, and let go."""
-    target = pose_of(env.base)
+    target = matrix(env.base.pose)
     target[2, 3] += env.base_edge + RELEASE_M
-    return [*PICK.strokes(pose_of(env.cube), rng), *set_down(target, PICK)]
+    return [*PICK.strokes(matrix(env.cube.pose), rng), *set_down(target, PICK)]
 
 
 SPEC = TaskSpec(
     name="stack",
     description="stack the cube on the other one",
     goal="the cube is on the other one",
-    env_id="RIP-Stack-v1",
     expert=stack,
     object_sets=("seen", "unseen"),
 )

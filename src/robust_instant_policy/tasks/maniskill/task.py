@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from typing import Any
 
 import gymnasium
 
@@ -16,7 +17,24 @@ from robust_instant_policy.tasks.simulated_task import SimulatedTask, TaskSpec, 
 TIMING = Timing(control_hz=RECORD_HZ, record_every=1, frame_every=4, execute_hz=EXECUTE_HZ)
 
 
-class CellTask(SimulatedTask):
+class ManiSkillTask(SimulatedTask):
+    """A `SimulatedTask` that resets quickly.
+
+    The simulator runs the garbage collector whenever it rebuilds a scene. Excluding the objects that exist now (torch
+    and other libraries) makes a reset several times faster.
+    """
+
+    def __init__(self, *args: Any):
+        super().__init__(*args)
+        gc.collect()
+        gc.freeze()
+
+    def close(self) -> None:
+        super().close()
+        gc.unfreeze()
+
+
+class CellTask(ManiSkillTask):
     """A task in the cell with the UR5e; ``objects``, ``assets`` and ``level`` as in `tasks.make_task`."""
 
     def __init__(self, spec: TaskSpec, objects: str, assets: str, level: Level):
@@ -26,14 +44,6 @@ class CellTask(SimulatedTask):
             spec.env_id, obs_mode="none", reward_mode="none", objects=objects, assets=assets, level=level
         )
         super().__init__(spec, env.unwrapped, [ur5e_hande()], TIMING, WORKSPACE, level)
-        # The simulator runs the garbage collector whenever it rebuilds a scene. Excluding the objects that exist now
-        # (torch and other libraries) makes a reset several times faster.
-        gc.collect()
-        gc.freeze()
-
-    def close(self) -> None:
-        super().close()
-        gc.unfreeze()
 
 
 def make(name: str, objects: str, assets: str, level: str) -> CellTask:

@@ -37,8 +37,7 @@ class TurnFaucetEnv(CellEnv):
     lever: Lever
     faucet: Mechanism
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         rng = self.draw("shape")
         if self.assets == "maniskill":
             self.faucet, self.lever = partnet.load_faucet(self.scene, self.objects, rng)
@@ -86,7 +85,6 @@ SPEC = TaskSpec(
     name="turn-faucet",
     description="turn the faucet's lever",
     goal="the faucet is turned on",
-    env_id="RIP-TurnFaucet-v1",
     expert=turn,
     object_sets=("seen", "unseen"),
     asset_sources=("code", "maniskill"),

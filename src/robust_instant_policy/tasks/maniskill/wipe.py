@@ -9,7 +9,8 @@ from mani_skill.utils.structs.actor import Actor
 
 from robust_instant_policy.geometry import FloatArray, invert_pose
 from robust_instant_policy.tasks.demonstrator import Stroke
-from robust_instant_policy.tasks.maniskill.block import Block, corners, pose_of
+from robust_instant_policy.tasks.maniskill.block import Block, corners
+from robust_instant_policy.tasks.maniskill.camera import matrix
 from robust_instant_policy.tasks.maniskill.cell import CellEnv
 from robust_instant_policy.tasks.maniskill.paint import BLACK, BRASS, RED, WHITE, Paint
 from robust_instant_policy.tasks.poses import downward, facing
@@ -38,8 +39,7 @@ class WipeEnv(CellEnv):
     length: float
     wiped: np.ndarray
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
+    def build_objects(self) -> None:
         self.length = float(self.draw("shape").uniform(*LENGTHS_M))
         self.height = HEIGHT_M[self.objects]
         size = (self.length, WIDTH_M[self.objects], self.height)
@@ -55,7 +55,7 @@ class WipeEnv(CellEnv):
 
     def advance(self, command: FloatArray) -> None:
         super().advance(command)
-        along, side, height = (invert_pose(pose_of(self.bar)) @ self.tool_poses()[0])[:3, 3]
+        along, side, height = (invert_pose(matrix(self.bar.pose)) @ self.tool_poses()[0])[:3, 3]
         if abs(side) <= SIDE_M and abs(height - self.height) <= TOUCH_M:
             middles = (np.arange(len(self.wiped)) + 0.5) * self.length / len(self.wiped) - self.length / 2
             self.wiped |= np.abs(middles - along) <= CELL_M
@@ -69,7 +69,7 @@ class WipeEnv(CellEnv):
 
 def wipe(env: WipeEnv, rng: np.random.Generator) -> list[Stroke]:
     """Close the gripper, descend on the first end, wipe along the bar to the other end, and retreat."""
-    bar, end = pose_of(env.bar), env.length / 2
+    bar, end = matrix(env.bar.pose), env.length / 2
 
     def at(along: float, height: float) -> FloatArray:
         return bar @ downward(along, 0.0, env.height + height, np.pi)
@@ -87,7 +87,6 @@ SPEC = TaskSpec(
     name="wipe",
     description="wipe the bar from its first end to the other",
     goal="the bar is wiped from end to end",
-    env_id="RIP-Wipe-v1",
     expert=wipe,
     object_sets=("seen", "unseen"),
 )

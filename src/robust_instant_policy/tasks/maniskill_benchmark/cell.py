@@ -16,7 +16,7 @@ from sapien.render import RenderBodyComponent
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.tasks.maniskill.camera import photograph, scene_truth
+from robust_instant_policy.tasks.maniskill.camera import matrix, photograph, scene_truth
 from robust_instant_policy.tasks.maniskill_benchmark.robot import FINGER_TRAVEL_M, NUM_JOINTS
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 
@@ -132,8 +132,3 @@ class PandaCell:
             body = link._objs[0].entity.find_component_by_type(RenderBodyComponent)
             if body is not None:
                 body.visibility = 0.0 if for_camera else 1.0
-
-
-def matrix(pose: Any) -> FloatArray:
-    """``(4, 4)`` of the first of a batch of poses of ManiSkill."""
-    return pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)

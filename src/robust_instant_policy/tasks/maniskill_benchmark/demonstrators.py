@@ -12,7 +12,8 @@ import numpy as np
 
 from robust_instant_policy.geometry import FloatArray, invert_pose, make_pose
 from robust_instant_policy.tasks.demonstrator import Stroke
-from robust_instant_policy.tasks.maniskill_benchmark.cell import PandaCell, matrix
+from robust_instant_policy.tasks.maniskill.camera import matrix
+from robust_instant_policy.tasks.maniskill_benchmark.cell import PandaCell
 from robust_instant_policy.tasks.poses import downward, pitched
 
 ABOVE_M = 0.10  # of the tool, over what it will grasp or has put down
@@ -79,8 +80,8 @@ def place_sphere(cell: PandaCell, rng: np.random.Generator) -> list[Stroke]:
 def lift_peg_upright(cell: PandaCell, rng: np.random.Generator) -> list[Stroke]:
     """Grasp the peg at its middle and put it upright about a place where the wrist can turn that far.
 
-    The place varies by centimetres, as a person's would: from paths that all end at one point, the checks conclude that
-    time was reversed.
+    The place varies by centimetres, as a person's would. (Paths that all end at one point look to the checks as if they
+    were recorded backwards.)
     """
     backward, forward = pitched(-0.3, 0.0), pitched(1.22, 0.0)
     tool = make_pose(backward, place(cell.env.peg))

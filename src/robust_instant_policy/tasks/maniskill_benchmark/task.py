@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import gc
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from robust_instant_policy.errors import UnknownNameError
-from robust_instant_policy.tasks.level import make_level
+from robust_instant_policy.checks import check_name
+from robust_instant_policy.tasks.level import CAMERA_LEVELS, Level, make_level
 from robust_instant_policy.tasks.maniskill.renderer import require_renderer
+from robust_instant_policy.tasks.maniskill.task import ManiSkillTask
 from robust_instant_policy.tasks.maniskill_benchmark import demonstrators
 from robust_instant_policy.tasks.maniskill_benchmark.benchmark import PREFIX
 from robust_instant_policy.tasks.maniskill_benchmark.cell import PandaCell, View
 from robust_instant_policy.tasks.maniskill_benchmark.robot import panda
-from robust_instant_policy.tasks.simulated_task import Expert, SimulatedTask, TaskSpec, Timing
+from robust_instant_policy.tasks.simulated_task import Expert, TaskSpec, Timing
 
-LEVELS = ("paper", "noise")  # the scenes are the benchmark's, so only the camera varies
 TIMING = Timing(control_hz=20.0, record_every=1, frame_every=2, execute_hz=5.0)  # control as in the environments
 WORKSPACE_M = ((-0.45, -0.45, -0.005), (0.45, 0.45, 0.5))
 
@@ -70,31 +69,21 @@ SPECS = {
 }
 
 
-class PandaTask(SimulatedTask):
+class PandaTask(ManiSkillTask):
     """``maniskill/NAME``: ManiSkill's environment ``NAME-v1`` with its own scenes, robot and rule of success."""
 
-    def __init__(self, name: str, level: str):
+    def __init__(self, name: str, level: Level):
         require_renderer()
-        own, env_id = SPECS[name], f"{name}-v1"
-        cell = PandaCell(env_id, own.view)
+        own = SPECS[name]
+        cell = PandaCell(f"{name}-v1", own.view)
         cell.reset(seed=0)
-        spec = TaskSpec(f"{PREFIX}{name}", own.description, own.goal, env_id, own.expert)
-        super().__init__(spec, cell, [panda(cell.base)], TIMING, np.array(own.workspace), make_level(level))
-        gc.collect()  # as in `maniskill.task.CellTask`
-        gc.freeze()
-
-    def close(self) -> None:
-        super().close()
-        gc.unfreeze()
+        spec = TaskSpec(f"{PREFIX}{name}", own.description, own.goal, own.expert)
+        super().__init__(spec, cell, [panda(cell.base)], TIMING, np.array(own.workspace), level)
 
 
 def make(name: str, objects: str, assets: str, level: str) -> PandaTask:
     """The task ``maniskill/NAME``."""
-    for what, asked, known in (
-        (f"set of objects of {name}", objects, ("seen",)),
-        (f"source of assets of {name}", assets, ("code",)),
-        (f"level of {name}", level, LEVELS),
-    ):
-        if asked not in known:
-            raise UnknownNameError(what, asked, known)
-    return PandaTask(name.removeprefix(PREFIX), level)
+    check_name(f"set of objects of {name}", objects, ("seen",))
+    check_name(f"source of assets of {name}", assets, ("code",))
+    check_name(f"level of {name}", level, CAMERA_LEVELS)
+    return PandaTask(name.removeprefix(PREFIX), make_level(level))

@@ -16,6 +16,7 @@ from metaworld.sawyer_xyz_env import SawyerMocapBase
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, make_pose
+from robust_instant_policy.tasks.mujoco_images import MujocoImages, pinhole
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Image
 
@@ -23,7 +24,7 @@ WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)  # Meta-World's 
 CONTROL_HZ = 80.0
 HORIZON = 500  # control steps of an episode, Meta-World's own
 STEP_M = 0.01  # by which an action of 1 moves the mocap body
-WIDTH_PX, HEIGHT_PX = 384, 256
+SIZE_PX = (384, 256)
 LOOK_AT_M, DISTANCE_M = (0.0, 0.68, 0.05), 1.05  # above and behind the robot's base, which is at the origin
 ELEVATION_DEG = -50.0
 FILM_CAMERA, FILM_PX = "corner3", (320, 320)
@@ -51,7 +52,7 @@ class Environment:
         base = self.model.body("base").id
         self.model.geom_group[self.model.body_rootid[self.model.geom_bodyid] == base] = HIDDEN_GROUP
         self.model.site_group[self.model.body_rootid[self.model.site_bodyid] == base] = HIDDEN_GROUP
-        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
+        self._images = MujocoImages(self.model, self.data)
         self._seen: FloatArray = np.zeros(0)  # the expert's observation
 
     def reset(self, seed: int) -> None:
@@ -96,23 +97,12 @@ class Environment:
 
     def photograph(self) -> Observation:
         """What the depth camera sees; the robot is not drawn."""
-        renderer = self._renderer(WIDTH_PX, HEIGHT_PX)
-        renderer.update_scene(self.data, _camera())
-        rgb = renderer.render().copy()
-        renderer.enable_depth_rendering()
-        depth = renderer.render().copy()
-        renderer.disable_depth_rendering()
-        focal = HEIGHT_PX / 2 / np.tan(np.deg2rad(self.model.vis.global_.fovy) / 2)
-        intrinsics = np.array([[focal, 0, (WIDTH_PX - 1) / 2], [0, focal, (HEIGHT_PX - 1) / 2], [0, 0, 1]])
-        return Observation(rgb, depth.astype(np.float32), intrinsics, _camera_pose())
+        rgb, depth = self._images.rgb(_camera(), SIZE_PX), self._images.depth(_camera(), SIZE_PX)
+        return Observation(rgb, depth, pinhole(SIZE_PX, self.model.vis.global_.fovy), _camera_pose())
 
     def scene_truth(self) -> SceneTruth:
         """Bodies and goal sites at the pixels of the camera, and their poses."""
-        renderer = self._renderer(WIDTH_PX, HEIGHT_PX)
-        renderer.update_scene(self.data, _camera())
-        renderer.enable_segmentation_rendering()
-        seen, kind = np.moveaxis(renderer.render(), -1, 0)
-        renderer.disable_segmentation_rendering()
+        seen, kind = np.moveaxis(self._images.segmentation(_camera(), SIZE_PX), -1, 0)
         model, data = self.model, self.data
         parts = np.full(seen.shape, -1)
         geoms, sites = kind == mujoco.mjtObj.mjOBJ_GEOM, kind == mujoco.mjtObj.mjOBJ_SITE
@@ -122,23 +112,16 @@ class Environment:
             f"site {model.site(i).name}" for i in range(model.nsite)
         ]
         turned = np.concatenate([data.xmat, data.site_xmat]).reshape(-1, 3, 3)
-        places = np.concatenate([data.xpos, data.site_xpos])
-        return SceneTruth(
-            parts, tuple(names), np.array([make_pose(*pair) for pair in zip(turned, places, strict=True)])
-        )
+        return SceneTruth(parts, tuple(names), make_pose(turned, np.concatenate([data.xpos, data.site_xpos])))
 
     def video_frame(self) -> Image:
         """A frame of one of the benchmark's own cameras, with the robot."""
-        renderer = self._renderer(*FILM_PX)
         options = mujoco.MjvOption()
         options.geomgroup[HIDDEN_GROUP] = 1
-        renderer.update_scene(self.data, FILM_CAMERA, options)
-        return renderer.render().copy()
+        return self._images.rgb(FILM_CAMERA, FILM_PX, options)
 
     def close(self) -> None:
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers.clear()
+        self._images.close()
         self.env.close()
 
     def _place_goals(self) -> None:
@@ -146,11 +129,6 @@ class Environment:
         mujoco.mj_forward(self.model, self.data)
         for site, place in self.env._target_site_config:
             self.env._set_pos_site(site, place)
-
-    def _renderer(self, width: int, height: int) -> mujoco.Renderer:
-        if (width, height) not in self._renderers:
-            self._renderers[width, height] = mujoco.Renderer(self.model, height, width)
-        return self._renderers[width, height]
 
 
 def _camera() -> mujoco.MjvCamera:

@@ -10,13 +10,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from robust_instant_policy.checks import check_name
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import RipError, UnknownNameError
+from robust_instant_policy.errors import RipError
 from robust_instant_policy.geometry import FloatArray, GripperTriangle, make_pose
 from robust_instant_policy.motion.gripper_changes import state_of_opening
 from robust_instant_policy.tasks.aloha.renderer import require_renderer
-from robust_instant_policy.tasks.level import NOISE, PAPER, Level, make_level
+from robust_instant_policy.tasks.level import CAMERA_LEVELS, PAPER, Level, make_level
 from robust_instant_policy.tasks.metaworld.benchmark import PREFIX
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Attempt, Execution, FrameSink, bounded_seed
@@ -31,7 +32,7 @@ SETTLE_STEPS = 20  # at the last waypoint
 FOLLOW_GAIN = 0.25  # share of the hand's error that an action corrects, as in most of the scripted experts
 MAX_STEP_M = 0.008  # of the commanded hand, so that an action of at most 10 mm an axis can correct it
 CLOSE_EFFORT, OPEN_EFFORT = 0.8, -1.0  # of the fingers; the scripted experts close with 0.6 to 1
-AFTER_SUCCESS_STEPS = 30  # that a demonstration goes on, so that it does not end at the rim of the goal
+AFTER_SUCCESS_STEPS = 30  # of a demonstration after success, so that it does not end at the border of the goal
 FRAME_EVERY = 4  # control steps from video frame to video frame
 SEED_BITS = 31
 
@@ -117,11 +118,8 @@ class MetaWorldTask:
         self._seed, self._images = seed, 0
 
     def _photograph(self) -> Observation:
-        seen, self._images = self._env.photograph(), self._images + 1
-        if self._level.camera is None:
-            return seen
-        noise = np.random.SeedSequence([self._last_seed(), self._images]).generate_state(1)[0]
-        return self._level.camera.photograph(seen, int(noise))
+        self._images += 1
+        return self._level.photographed(self._env.photograph(), self._last_seed(), self._images)
 
     def _follow_hand(self, path: Iterator[tuple[FloatArray, bool]], on_frame: FrameSink | None) -> float:
         """Command the hand along ``path`` of fingertip points and gripper states, one a control step, until success or
@@ -171,11 +169,7 @@ def _hand_path(
 
 def make(name: str, objects: str, assets: str, level: str) -> MetaWorldTask:
     """The task ``name``; Meta-World has one set of objects."""
-    for kind, given, known in (
-        (f"set of objects of {name}", objects, ("seen",)),
-        (f"source of assets of {name}", assets, ("code",)),
-        (f"level of {name}", level, (PAPER.name, NOISE.name)),
-    ):
-        if given not in known:
-            raise UnknownNameError(kind, given, known)
+    check_name(f"set of objects of {name}", objects, ("seen",))
+    check_name(f"source of assets of {name}", assets, ("code",))
+    check_name(f"level of {name}", level, CAMERA_LEVELS)
     return MetaWorldTask(name, make_level(level))
