@@ -2,14 +2,17 @@
 
     python benchmarks/perception.py accuracy             # against the simulator's truth, all tasks
     python benchmarks/perception.py hard                 # the same in hard scenes, with the confidence; resumable
+    python benchmarks/perception.py missing              # one demonstration does not show the object
     python benchmarks/perception.py real DIR --out OUT   # photographs with outlines, see perception_real.py
     python benchmarks/perception.py picture              # docs/images/keypoints.jpg
+    python benchmarks/perception.py scene-speed          # seconds, 640×480 pixels with six things
     python benchmarks/perception.py speed                # ratios to one pass of the network
     python benchmarks/perception.py speed --reference CHECKOUT    # beside ShirAmir/dino-vit-features
     python benchmarks/perception.py speed --features dino --columns real      # one line of the table
 
-Writes `docs/tables/perception_accuracy.md`, `perception_hard.md` and `perception_speed.md`; keeps each scene of the
-second in `results/perception_hard.jsonl` and each line of the third in `results/perception_speed.json`.
+Writes `docs/tables/perception_accuracy.md`, `perception_hard.md`, `perception_missing.md` and `perception_speed.md`;
+keeps each scene of the second in `results/perception_hard.jsonl` and each line of the last in
+`results/perception_speed.json`.
 """
 
 from __future__ import annotations
@@ -32,12 +35,13 @@ import numpy as np
 import torch
 from dino_reference import ReferenceTransformer, load_reference, random_checkpoint
 from perception_hard import hard
+from perception_missing import missing
 from perception_real import real
 from PIL import Image, ImageDraw
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.evaluation.paper import TABLE1_TASKS
-from robust_instant_policy.evaluation.scenes import SPLITS
+from robust_instant_policy.evaluation.scenes import SPLITS, obtain_demonstrations, scene_seed
 from robust_instant_policy.evaluation.suites import SIMULATION_TASKS
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception import (
@@ -61,9 +65,11 @@ from robust_instant_policy.tasks.scene_truth import SceneTruth
 
 ROOT = Path(__file__).parent.parent
 TABLES, KEPT_SPEED = ROOT / "docs" / "tables", ROOT / "results" / "perception_speed.json"
+KEPT_SCENE_SPEED = ROOT / "results" / "perception_scene_speed.json"
 DEMONSTRATIONS, NEW_SCENES = 10, 20
 FIRST_NEW_SEED = 100_000  # demonstrations count from 0
 ROUNDS = {"dino": 1, "efficientnet": 15}  # of each measurement; the shortest counts
+TIMED_SCENES = 10
 MAX_MEMORY_GIB = 2.0
 PICTURE_PX = 360
 Camera = Callable[[Observation, int], Observation]
@@ -252,6 +258,34 @@ def speed(features: list[str], columns: list[str], checkout: Path | None) -> Non
     write_speed()
 
 
+def scene_speed(name: str, data: Path) -> None:
+    """Time of a fit to ten hard demonstrations with their paths and of a new scene, kept in `KEPT_SCENE_SPEED`."""
+    task = make_task(name, level="hard")
+    shown = obtain_demonstrations(task, data / name, DEMONSTRATIONS)
+    new = [task.reset(scene_seed(0, index)) for index in range(TIMED_SCENES)]
+    task.close()
+    extractor = KeypointExtractor(features="efficientnet", workspace=task.workspace)
+    watch = time.monotonic(), time.process_time()
+    extractor.fit([one.observation for one in shown], [one.trajectory for one in shown])
+    fitted = time.monotonic(), time.process_time()
+    for scene in new:
+        extractor.locate(scene)
+    located = time.monotonic(), time.process_time()
+    height, width = new[0].depth.shape
+    found = {
+        "task": name,
+        "pixels": f"{width}x{height}",
+        "objects": len(extractor.objects_),
+        "load of the machine": round(os.getloadavg()[0], 1),
+        "cores": os.cpu_count(),
+    }
+    for at, kind in enumerate(("wall", "processor")):
+        found[f"fit, s of {kind} time"] = round(fitted[at] - watch[at], 2)
+        found[f"new scene, s of {kind} time"] = round((located[at] - fitted[at]) / len(new), 3)
+    KEPT_SCENE_SPEED.write_text(json.dumps(found, indent=1) + "\n")
+    print(json.dumps(found, indent=1))
+
+
 def write_speed() -> None:
     """Write the table from the kept measurements; exit with an error if one needs more than `MAX_MEMORY_GIB`."""
     rows = [
@@ -290,6 +324,9 @@ def main() -> None:
     harder.add_argument("--data", type=Path, default=ROOT / "data" / "hard", help="folder of the demonstrations")
     harder.add_argument("--rows", type=Path, default=ROOT / "results" / "perception_hard.jsonl")
     harder.add_argument("--table", type=Path, default=TABLES / "perception_hard.md")
+    gone = commands.add_parser("missing")
+    gone.add_argument("--scenes", type=int, default=5)
+    gone.add_argument("--data", type=Path, default=ROOT / "data" / "hard", help="folder of the demonstrations")
     commands.add_parser("picture").add_argument("--task", default="open-drawer")
     photographs = commands.add_parser("real")
     photographs.add_argument("folder", type=Path)
@@ -302,6 +339,9 @@ def main() -> None:
     quick.add_argument("--reference", type=Path)
     quick.add_argument("--features", nargs="+", choices=list(ROUNDS), default=list(ROUNDS))
     quick.add_argument("--columns", nargs="+", choices=list(COLUMNS), default=list(COLUMNS))
+    timed = commands.add_parser("scene-speed")
+    timed.add_argument("--task", default="aloha-pick-place")
+    timed.add_argument("--data", type=Path, default=ROOT / "data" / "hard", help="folder of the demonstrations")
     one = commands.add_parser("one", help="(used by speed)")
     for name in ("features", "column", "weights"):
         one.add_argument(name)
@@ -311,6 +351,8 @@ def main() -> None:
     elif arguments.command == "hard":
         settings = arguments.tasks, arguments.split, arguments.correspondence, arguments.scenes
         hard(*settings, arguments.data, arguments.rows, arguments.table)
+    elif arguments.command == "missing":
+        missing(arguments.data, arguments.scenes, TABLES / "perception_missing.md")
     elif arguments.command == "real":
         if not (arguments.folder / "pair.json").exists():
             parser.error(f"{arguments.folder} holds no pair.json; perception_real.py describes the folder")
@@ -318,6 +360,8 @@ def main() -> None:
         real(arguments.folder, out, arguments.features, arguments.keypoints, arguments.tilt, arguments.correspondence)
     elif arguments.command == "picture":
         picture(arguments.task)
+    elif arguments.command == "scene-speed":
+        scene_speed(arguments.task, arguments.data)
     elif arguments.command == "speed":
         speed(arguments.features, arguments.columns, arguments.reference)
     else:

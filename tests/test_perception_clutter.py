@@ -6,10 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.geometry import GripperTriangle, make_pose, project
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.perception.view import make_view
+from robust_instant_policy.policies.context import build_context
+from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.trajectory import Trajectory
 
@@ -316,3 +318,70 @@ def test_of_two_alike_things_the_one_at_the_hand_is_the_grasped_one(first):
     of_grasped = found[:, found[0] == 0]
     assert of_grasped.shape[1] >= 3
     assert not of_grasped.any()
+
+
+@pytest.mark.parametrize(("demonstration", "kind"), [(3, "missing"), (2, "recoloured"), (0, "missing")])
+def test_a_demonstration_without_the_grasped_thing_is_left_out_and_told(demonstration, kind):
+    scenes = [blocks_at(seed, halves=(0.04, 0.03)) for seed in range(6)]
+    paths = [path_to(*blocks[1][:2]) for blocks in scenes]
+    shown = [list(blocks) for blocks in scenes]
+    *place, _ = shown[demonstration].pop()
+    if kind == "recoloured":
+        shown[demonstration].append((*place, ((150, 40, 200), (250, 140, 20))))
+    images = [photograph(blocks) for blocks in shown]
+    extractor = KeypointExtractor(6, features="efficientnet").fit(images[:5], paths[:5])
+    assert np.flatnonzero(extractor.left_out_).tolist() == [demonstration]
+    assert any(note.startswith(f"demonstration {demonstration} is left out") for note in extractor.notes_)
+    known = owners(extractor.pixels_[1], images[1], scenes[1])
+    assert known.count(1) >= 3
+    assert owners(extractor.locate(images[5]).pixels, images[5], scenes[5]) == known
+
+
+def test_a_thing_that_a_rod_cuts_in_two_colours_in_the_first_image_is_one_thing():
+    """Each half has its own colour, so that only their motion tells that they are one."""
+
+    def scene(seed: int, rod: bool):
+        x, y = places(seed, 1)[0]
+        halves = [(x + side, y, 0.018, 0.05, (COLOURS[0][k],) * 2) for k, side in enumerate((-0.02, 0.02))]
+        hidden = [(x * 0.7 / 0.95, y + at, 0.006, 0.3, ((15, 15, 15),) * 2) for at in np.arange(-0.5, 0.6, 0.01)]
+        return halves, photograph([*halves, *(hidden if rod else [])], size=256)
+
+    scenes = [scene(seed, seed == 0) for seed in range(5)]
+    extractor = KeypointExtractor(features="efficientnet").fit([image for _, image in scenes[:4]])
+    assert len(extractor.objects_) == 1
+    halves, image = scenes[4]
+    moved = np.subtract(halves[0][:2], scenes[0][0][0][:2])
+    errors = np.linalg.norm(extractor.locate(image).keypoints[:, :2] - extractor.keypoints_[0, :, :2] - moved, axis=1)
+    assert errors.max() < 0.02
+
+
+def test_an_object_of_another_size_has_less_confidence_and_an_unusual_stretch_speaks_against_a_turn():
+    def scene(seed: int, long: float):
+        x, y = places(seed, 1)[0]
+        bar = [(x + along, y, 0.02, 0.05, COLOURS[1]) for along in np.arange(-long, long + 0.001, 0.01)]
+        return photograph(bar), path_to(x, y)
+
+    demonstrations = [scene(seed, 0.04) for seed in range(5)]
+    extractor = KeypointExtractor(4, features="efficientnet").fit(*map(list, zip(*demonstrations, strict=True)))
+    same, longer = (extractor.locate(scene(7, long)[0]).confidence.mean() for long in (0.04, 0.06))
+    assert longer < 0.7 * same
+    surroundings = extractor.objects_[0].model.surroundings
+    unseen = np.zeros((2, len(surroundings.cells)), dtype=np.int8)
+    usual, exchanged = surroundings.log_chance_of(unseen, np.array([[0.0, 0.0], [0.3, -0.3]]))
+    assert usual - exchanged > 3
+
+
+def test_the_context_holds_the_demonstrations_that_show_the_grasped_thing():
+    scenes = [blocks_at(seed, halves=(0.04, 0.03)) for seed in range(6)]
+    shown = [list(blocks) for blocks in scenes]
+    shown[3][1] = (*scenes[3][1][:4], ((150, 40, 200), (250, 140, 20)))
+    demonstrations = [
+        Demonstration(photograph(blocks), path_to(*scene[1][:2]), 10.0)
+        for blocks, scene in zip(shown, scenes, strict=True)
+    ]
+    context = build_context(demonstrations, Settings(features="efficientnet"))
+    assert len(context.keypoints) == len(context.trajectories) == len(demonstrations) - 1
+    assert len(context.pixels) == len(demonstrations)
+    assert np.isin(
+        demonstrations[4].trajectory.actions[-1, :3].round(3), context.trajectories[3].actions.round(3)
+    ).all()

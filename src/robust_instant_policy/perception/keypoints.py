@@ -8,7 +8,7 @@ from functools import wraps
 from typing import ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from robust_instant_policy.demonstration import Observation
@@ -16,13 +16,13 @@ from robust_instant_policy.errors import InvalidValueError, KeypointError, Unkno
 from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
-from robust_instant_policy.perception.matching import certainty, find_again, register_all
-from robust_instant_policy.perception.models import Registration, RigidObject
+from robust_instant_policy.perception.matching import certainty, find_again, plausibility, register_all
+from robust_instant_policy.perception.models import MIN_FITNESS, Registration, RigidObject
 from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
-from robust_instant_policy.perception.objects import MIN_FITNESS, find_objects, segmentation, without
+from robust_instant_policy.perception.objects import find_objects, segmentation, without
 from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
-from robust_instant_policy.perception.relevance import hand_places, relevances, shares, still
+from robust_instant_policy.perception.relevance import hand_places, reference, relevances, shares, still
 from robust_instant_policy.perception.selection import best_buddies, select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
 from robust_instant_policy.perception.view import Hands, View, make_view
@@ -73,8 +73,9 @@ class KeypointExtractor:
     `perception.nearest`), which uses no workspace. Deterministic for a ``seed``.
 
     After `fit`: ``keypoints_ (I, K, 3)`` metres, world, ``pixels_ (I, K, 2)`` (u, v) and ``confidence_ (I, K)`` in
-    [0, 1] of I demonstrations; ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``object_of_ (K,)``, the
-    number of each keypoint's; ``segmentations_``, see `segmentation`; ``notes_`` for the user, one line each.
+    [0, 1] of I demonstrations; ``left_out_ (I,)``, those that do not show an object with keypoints, which are guessed
+    there; ``network_`` and its name, ``descriptor_name_``; ``objects_``; ``object_of_ (K,)``, the number of each
+    keypoint's; ``segmentations_``, see `segmentation`; ``notes_`` for the user, one line each.
     """
 
     def __init__(
@@ -130,12 +131,19 @@ class KeypointExtractor:
             )
         if len({observation.rgb.shape for observation in observations}) > 1:
             notes.append("the images differ in size; each was brought to the same")
-        objects = find_objects(views, self.seed, hand_places(views, trajectories) if trajectories else None)
-        self.objects_ = without(objects, [thing.worst_fitness < MIN_FITNESS for thing in objects])
+        order = list(range(len(views)))  # exchanges the first with the reference, and back
+        hands = None
+        if trajectories is not None:
+            hands = hand_places(views, trajectories)
+            first = reference(views, hands)
+            order[0], order[first] = first, 0
+            views, trajectories, hands = [views[i] for i in order], [trajectories[i] for i in order], hands[order]
+        objects = find_objects(views, self.seed, hands)
+        self.objects_ = without(objects, [not thing.shared for thing in objects])
         if not self.objects_:
-            best = max((thing.worst_fitness for thing in objects), default=0.0)
+            best = max((min(one.fitness for one in thing.registrations) for thing in objects), default=0.0)
             raise KeypointError(
-                f"the images have nothing in common: the best object of the first has a fitness of {best:.2f} in the "
+                f"the images have nothing in common: the best object of one of them has a fitness of {best:.2f} in the "
                 f"worst other image (needed: {MIN_FITNESS:.2f}); do all demonstrations show the same object?"
             )
         weights = _weights(self.objects_, views, trajectories)
@@ -152,15 +160,24 @@ class KeypointExtractor:
             )
             self._places.append(points)
             notes += replaced
-        found = [self._locate(view, [t.registrations[i] for t in self.objects_]) for i, view in enumerate(views)]
+        registrations = [[thing.registrations[i] for thing in self.objects_] for i in order]
+        views = [views[i] for i in order]
+        found = [self._locate(*pair) for pair in zip(views, registrations, strict=True)]
         self.keypoints_ = np.stack([located.keypoints for located in found])
         self.pixels_ = np.stack([located.pixels for located in found])
         self.confidence_ = np.stack([located.confidence for located in found])
         self.object_of_ = np.repeat(np.arange(len(counts)), counts)
+        missing = ~np.array([thing.shown[order] for thing in self.objects_])  # (O, I)
+        missing[np.array(counts) == 0] = False
+        self.left_out_: NDArray[np.bool_] = np.asarray(missing.any(axis=0))
+        for number, i in np.argwhere(missing):
+            notes.append(
+                f"demonstration {i} is left out: object {number}, which has keypoints, is missing there, hidden, or of "
+                "another look"
+            )
         models = [thing.model for thing in self.objects_]
         self.segmentations_ = tuple(
-            segmentation(models, [thing.registrations[i] for thing in self.objects_], view)
-            for i, view in enumerate(views)
+            segmentation(models, own, view) for own, view in zip(registrations, views, strict=True)
         )
         self.notes_ = tuple(notes)
         return self
@@ -175,6 +192,7 @@ class KeypointExtractor:
         ]
         self.keypoints_, self.pixels_ = (np.stack(of_images) for of_images in zip(*found, strict=True))
         self.confidence_ = self._shared.agreement()
+        self.left_out_ = np.zeros(len(images), dtype=bool)
         return self
 
     @one_blas_thread
@@ -213,7 +231,8 @@ class KeypointExtractor:
         expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
         points, pixels, measured = lift_to_surface(view.observation, view.depth, expected)
         counts = [len(places) for places in self._places]
-        confidence = np.repeat([found.fitness * found.similarity for found in registrations], counts)
+        quality = [found.fitness * found.similarity * plausibility(t.model, found, view) for t, _, found in triples]
+        confidence = np.repeat(quality, counts)
         confidence *= np.concatenate(
             [certainty(t.model, found, view, places) for t, places, found in triples if len(places)]
         )
@@ -242,18 +261,18 @@ def _weights(
     """Of objects ``(O,)``, for their numbers of keypoints."""
     places = [
         [
-            transform_points(view.to_world @ found.motion, thing.points)
-            for view, found in zip(views, thing.registrations, strict=True)
+            transform_points(view.to_world @ found.motion, thing.points) if shown else None
+            for view, found, shown in zip(views, thing.registrations, thing.shown, strict=True)
         ]
         for thing in things
     ]
     if trajectories is not None:
         relevant = relevances(places, trajectories)
         if relevant.any():
-            return relevant
-    sizes = np.array([len(points[0]) for points in places], dtype=np.float64)
+            return relevant * np.array([thing.typical_fitness for thing in things])
+    sizes = np.array([len(thing.points) for thing in things], dtype=np.float64)
     weights = 1 + sizes / (1e3 * sizes.max())  # equal, but with too few keypoints the largest come first
-    scenery = np.array([still(points) for points in places])
+    scenery = np.array([still([one for one in points if one is not None]) for points in places])
     return weights if scenery.all() else np.where(scenery, weights * SCENERY_WEIGHT, weights)
 
 

@@ -32,17 +32,22 @@ from robust_instant_policy.perception.registration import (
     vote_for_motions,
     within,
 )
-from robust_instant_policy.perception.view import MIN_OBJECT_M2, TARGET_M, View
+from robust_instant_policy.perception.view import MIN_OBJECT_M2, TARGET_M, View, spread_out
 
 MIN_TARGET_POINTS = round(MIN_OBJECT_M2 / TARGET_M**2)  # of an image; with fewer nothing is registered in it
 CLAIM_M = 0.012  # from a registered object's points: image points that it explains
-EVIDENCE_SCALE = 8.0  # of the surroundings' evidence: neighbouring cells of the grid are not independent
+DECISIONS = 3  # at most, between a motion and its rivals
 MIN_ADVANTAGE = 1.0  # of the logarithm of the chance, for a motion that replaces the one that ICP found
 MAX_RIVAL_LOSS = 6.0  # in units of RIVAL_SCALE, for a motion that the surroundings may speak for
 RIVAL_SCALE = 0.03  # of the score by which a motion is worse, for a weight of 1/e
 SAME_PLACE_M = 0.02  # mean distance of an object's points under two motions, for the same place
 SHAPE_REACH_M = 0.03  # from an object: greatest distance of points of a larger one of its kind
 PART_TURNS = np.deg2rad(np.arange(-60.0, 90.0, 30.0))  # of a part against its object
+QUARTER_TURNS = np.deg2rad([0.0, 90.0, 180.0, 270.0])  # of an object at a piece of its size
+PIECE_SIZES = 2.5  # factor between the surfaces of an object and of a piece that may be it
+MAX_TAKEN = 0.5  # of the points of such a piece, by other objects
+REACHED_M = 0.03  # by a voted motion, from which ICP starts
+UNUSUAL_STRETCH = 0.3  # logarithm of a change of size, for a confidence of 1/e
 MUCH_BETTER = 0.05  # of the score, by which an object's own registration overrules that with its parts
 MAX_PART_TRAVEL_M = 0.2  # against its object
 MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one,
@@ -147,6 +152,8 @@ def register(
         motions.append(rotated(parent, centre, PART_TURNS))
     if vote:
         motions.append(vote_for_motions(points, goals, matches))
+        if parent is None:
+            motions.append(_at_pieces(templates[0], view, motions[-1], taken))
     if beside is not None and (apart := ~within(goals, beside, CLAIM_M)).any():
         motions.append(vote_for_motions(points, goals[apart], matches[:, apart]))
     candidates = np.concatenate(motions)
@@ -158,6 +165,28 @@ def register(
     refined = refine(candidates, source, target, similarity, view.hides, colour_cap)
     pose = settle_turn(refined.motions[0], source, target, similarity, view.hides, colour_cap)
     return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index, refined.motions[1:])
+
+
+def _at_pieces(template: Template, view: View, voted: FloatArray, taken: FloatArray | None) -> FloatArray:
+    """Motions ``(S, 4, 4)`` that put an object of ``template`` at the pieces of ``view`` of about its size that none of
+    the ``voted (P, 4, 4)`` motions reaches: the descriptors of a small or an unlike object may all be wrong.
+    """
+    centre = template.surface.mean(axis=0).astype(np.float64)
+    reached = voted[:, :3, :3] @ centre + voted[:, :3, 3]
+    motions = [NO_MOTIONS]
+    for piece in view.pieces:
+        points = view.points[piece]
+        place = points.mean(axis=0)
+        if (np.linalg.norm(reached - place, axis=1) < REACHED_M).any():
+            continue
+        if not 1 / PIECE_SIZES < len(spread_out(points)) / len(template.surface) < PIECE_SIZES:
+            continue
+        if taken is not None and len(taken) and within(points, taken, CLAIM_M).mean() > MAX_TAKEN:
+            continue
+        motion = np.eye(4)
+        motion[:3, 3] = place - centre
+        motions.append(rotated(motion, centre, QUARTER_TURNS))
+    return np.concatenate(motions)
 
 
 def find_again(
@@ -183,7 +212,11 @@ def explained(
     models: Sequence[Model], found: Sequence[Registration] | Mapping[int, Registration], which: Sequence[int]
 ) -> FloatArray:
     """Points ``(N, 3)`` of the objects ``which``, where they were found."""
-    moved = [transform_points(found[i].motion, models[i].templates[found[i].template].surface) for i in which]
+    moved = [
+        transform_points(found[i].motion, models[i].templates[found[i].template].surface)
+        for i in which
+        if found[i].fitness
+    ]
     return np.concatenate([np.zeros((0, 3)), *moved])
 
 
@@ -258,15 +291,18 @@ def _preferred(model: Model, poses: FloatArray, chance: FloatArray) -> int:
     return best if elsewhere[best] and chance[best] > chance[~elsewhere].max() + MIN_ADVANTAGE else 0
 
 
-def _decided(model: Model, found: Registration, view: View) -> Registration:
-    """``found`` or the rival of it that what ``view`` shows around the object speaks for, with the chances of all."""
+def _decided(model: Model, found: Registration, view: View, rounds: int = DECISIONS) -> Registration:
+    """``found`` or the rival of it that what ``view`` shows around the object speaks for, with the chances of all.
+
+    A rival has rivals of its own: so many ``rounds``.
+    """
     if model.surroundings is None or not found.fitness:
         return found
     rivals = alternatives(model, found, view)
     chance = (rivals.score - rivals.score.max()) / RIVAL_SCALE
     kept = np.union1d(0, np.flatnonzero(chance > -MAX_RIVAL_LOSS))
     motions = stretched(model, rivals.motions[kept], view) if model.surroundings.stretch else rivals.motions[kept]
-    chance = chance[kept] + model.surroundings.evidence(view, motions) / EVIDENCE_SCALE
+    chance = chance[kept] + model.surroundings.log_chance(view, motions)
     best = _preferred(model, rivals.motions[kept], chance)
     order = np.array([best, *(k for k in range(len(kept)) if k != best)])
     shares = np.exp(np.minimum(chance[order] - chance[best], 0))
@@ -275,7 +311,7 @@ def _decided(model: Model, found: Registration, view: View) -> Registration:
         source = model.templates[found.template].xyzrgb
         measured = similarity_in(model.templates, view)
         pose, fitness, similarity = refine_pose(pose, source, view.target, measured, view.hides, model.colour_cap)
-    return replace(
+    decided = replace(
         found,
         pose=pose,
         fitness=fitness,
@@ -283,6 +319,16 @@ def _decided(model: Model, found: Registration, view: View) -> Registration:
         rivals=rivals.motions[kept[order[1:]]],
         shares=shares / shares.sum(),
     )
+    return _decided(model, decided, view, rounds - 1) if best and rounds > 1 else decided
+
+
+def plausibility(model: Model, found: Registration, view: View) -> float:
+    """In [0, 1]: less where an object would have another size than in the reference image, or other surroundings than
+    in the demonstrations. A wrong turn often needs both.
+    """
+    stretch = np.abs(np.log(np.linalg.eigvalsh(found.shape[:3, :3]))).max()
+    likeness = 1.0 if model.surroundings is None else model.surroundings.likeness(view, found.motion)
+    return float(np.exp(-((stretch / UNUSUAL_STRETCH) ** 2)) * likeness)
 
 
 def certainty(model: Model, found: Registration, view: View, points: FloatArray) -> FloatArray:

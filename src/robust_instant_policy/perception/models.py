@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from robust_instant_policy.geometry import FloatArray, project, transform_points
@@ -18,6 +19,10 @@ MAX_TEMPLATE_POINTS = 250  # of an object in one image
 MAX_TEMPLATE_CELLS = 80  # of its descriptors there
 SAME_OBJECT_M = 0.025  # from a registered object's points: greatest distance of other points of the object
 BEST_TEMPLATES = 3  # whose mean descriptor similarity rates a motion
+MIN_FITNESS = 0.15  # of the registration in an image that shows the object
+SAME_THING_FITNESS = 0.5  # things of one kind in other colours have 0.3, in the same 0.7
+TYPICAL_FITNESS = 0.35  # of what is there, more than that of wrong things of about the size
+MAX_MISSING = 0.3  # share of the images in which an object may be missing that is well recognised in the others
 NO_MOTIONS = np.zeros((0, 4, 4))
 
 
@@ -97,8 +102,25 @@ class RigidObject:
         return self.model.points
 
     @property
-    def worst_fitness(self) -> float:
-        return min(registration.fitness for registration in self.registrations)
+    def shown(self) -> NDArray[np.bool_]:
+        """Which images ``(I,)`` show it: in the others it is missing, hidden, or looks different."""
+        return np.array([one.fitness >= MIN_FITNESS for one in self.registrations])
+
+    @property
+    def shared(self) -> bool:
+        """Whether all images show it, or all but a few where it is well recognised in the others."""
+        shown = self.shown
+        if shown.all():
+            return True
+        if (~shown).mean() > MAX_MISSING:
+            return False
+        return self.typical_fitness >= TYPICAL_FITNESS
+
+    @property
+    def typical_fitness(self) -> float:
+        """Median over the images that show it, but the reference image: how well it can be recognised."""
+        shown = [one.fitness for one in self.registrations if one.fitness >= MIN_FITNESS]
+        return float(np.median(shown[1:] or shown))
 
 
 def template_of(home: View, piece: IntArray, seed: int) -> Template:

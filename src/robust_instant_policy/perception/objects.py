@@ -13,7 +13,6 @@ from robust_instant_policy.geometry import FloatArray, fit_upright, invert_pose,
 from robust_instant_policy.perception.descriptors import Float32Array, IntArray
 from robust_instant_policy.perception.matching import (
     CLAIM_M,
-    EVIDENCE_SCALE,
     MAX_PART_TRAVEL_M,
     MAX_RIVAL_LOSS,
     RIVAL_SCALE,
@@ -28,7 +27,10 @@ from robust_instant_policy.perception.matching import (
 )
 from robust_instant_policy.perception.models import (
     IN_REFERENCE,
+    MAX_MISSING,
+    MIN_FITNESS,
     NO_MOTIONS,
+    SAME_THING_FITNESS,
     Model,
     Registration,
     RigidObject,
@@ -36,10 +38,16 @@ from robust_instant_policy.perception.models import (
     similarity_in,
     template_of,
 )
-from robust_instant_policy.perception.parts import MIN_GAIN, candidate_parts, gain
-from robust_instant_policy.perception.pieces import UNRELATED
-from robust_instant_policy.perception.registration import COLOUR_CAP_M, KEPT_COLOUR_CAP_M, refine, refine_pose
-from robust_instant_policy.perception.surroundings import Surroundings, grid_around, shown
+from robust_instant_policy.perception.parts import MIN_GAIN, UNEXPLAINED_M, candidate_parts, gain, surface_distances
+from robust_instant_policy.perception.pieces import STRIP_M, UNRELATED
+from robust_instant_policy.perception.registration import (
+    COLOUR_CAP_M,
+    KEPT_COLOUR_CAP_M,
+    horizontal_axes,
+    refine,
+    refine_pose,
+)
+from robust_instant_policy.perception.surroundings import Surroundings, grid_around, log_sizes, shown
 from robust_instant_policy.perception.view import View
 
 KEPT_COLOUR_M = 0.008  # median over images of the distance in colour, for an object that keeps its colours
@@ -47,9 +55,9 @@ HAND_REACH_M = 0.05  # of an object's points, at which a place of the hand count
 MIN_NEAR = 0.2  # of that count, from which on the hand handles an object
 HAND_SPREAD_M = 0.04  # standard deviation of the hand's places in the frame of an object that it handles
 MAX_HAND_LOSS = 12.0  # of the logarithm of a motion's chance, for one place of the hand
+GONE = 0.3  # of the greatest loss, for an object that is not where the hand takes it,
+HELD = 0.1  # if the hand takes it there in most demonstrations
 ALIGNMENT_ROUNDS = 3  # over all demonstrations
-MIN_FITNESS = 0.15  # of an object's registration in every demonstration
-SAME_THING_FITNESS = 0.5  # things of one kind in other colours have 0.3, in the same 0.7
 MAX_OBJECTS = 30  # with their parts
 SAME_SIZE = 0.04  # greatest logarithm of the stretch between views of an object of one size
 MIN_IMAGES_OF_KIND = 3  # that tell whether objects differ in size
@@ -66,7 +74,7 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
     tell how a thing is turned that is grasped or pushed at the same place in all of them.
     """
     home = views[0]
-    pieces = list(home.pieces)
+    pieces = _joined(home, views[1:], seed) if len(views) > 1 else list(home.pieces)
     models = [Model((template_of(home, piece, seed),)) for piece in pieces]
     found = [[IN_REFERENCE] * len(models), *(register_all(models, view) for view in views[1:])]
     handled: set[int] = set()
@@ -101,7 +109,7 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
         family = (template_of(home, np.concatenate([pieces[i] for i in members]), seed),)
         models[number] = replace(models[number], family=family)
     things = [_complete(models, found, number, views, seed, handled) for number in range(len(models))]
-    if all(thing.worst_fitness < MIN_FITNESS for thing in things):  # do they have other colours in some images?
+    if not any(thing.shared for thing in things):  # do they have other colours in some images?
         models = [replace(model, colour_cap=COLOUR_CAP_M) for model in models]
         things = [_complete(models, found, number, views, seed, handled) for number in range(len(models))]
     shapes = [
@@ -112,6 +120,26 @@ def find_objects(views: Sequence[View], seed: int, hands: FloatArray | None = No
         _with_surroundings(_with_shapes(thing, [row[number] for row in shapes]) if varies else thing, views)
         for number, (thing, varies) in enumerate(zip(things, _vary(np.array(shapes)), strict=True))
     ]
+
+
+def _joined(home: View, views: Sequence[View], seed: int) -> list[IntArray]:
+    """The pieces of the first view; those that are near each other, and that one motion explains in the other
+    ``views``, are one: something hid what is between them.
+    """
+    pieces = list(home.pieces)
+    for number in np.argsort([-len(piece) for piece in pieces], kind="stable"):
+        for other in range(len(pieces)):
+            one, two = pieces[number], pieces[other]
+            if other == number or not 0 < len(two) <= len(one):
+                continue
+            if cKDTree(home.points[one]).query(home.points[two])[0].min() > STRIP_M:
+                continue
+            both = np.concatenate([one, two])
+            templates = (template_of(home, both, seed),)
+            motions = [register(templates, view).pose for view in views]
+            if all(surface_distances(home.points[part], views, motions).mean() < UNEXPLAINED_M for part in (both, two)):
+                pieces[number], pieces[other] = both, both[:0]
+    return [piece for piece in pieces if len(piece)]
 
 
 def _aligned(
@@ -135,22 +163,25 @@ def _aligned(
             ).motions
         rivals = alternatives(model, one, view, by_hand)
         prior = (rivals.score - rivals.score.max()) / RIVAL_SCALE
-        back = np.linalg.inv(rivals.motions)
-        moved = hands[number] @ np.swapaxes(back[:, :3, :3], 1, 2) + back[:, None, :3, 3]
-        squares = ((moved - hands[0]) ** 2).sum(axis=2) / (2 * HAND_SPREAD_M**2)
-        prior = prior - np.minimum(squares, MAX_HAND_LOSS) @ near
+        prior = prior - _hand_loss(rivals.motions, hands[0], hands[number], near)
         kept = np.union1d(0, np.flatnonzero(prior > prior.max() - 2 * MAX_RIVAL_LOSS))
         poses.append(rivals.motions[kept])
         options.append(stretched(model, poses[-1], view) if stretch else poses[-1])
         priors.append(prior[kept])
     cells, grid = grid_around(points)
+    axes = horizontal_axes(points)[:2, :2]
     states = [shown(cells, view, motions) for view, motions in zip(views, options, strict=True)]
+    sizes = [log_sizes(axes, motions) for motions in options]
+
+    def agreed(which: Sequence[int]) -> Surroundings:
+        seen, own = (np.array([values[k][chosen[k]] for k in which]) for values in (states, sizes))
+        return Surroundings.from_states(cells, grid, seen, stretch, axes, own)
+
     chosen = [0] * len(views)
     for turn in range(ALIGNMENT_ROUNDS):
         for i in range(1, len(views)):
-            others = np.array([states[k][chosen[k]] for k in range(len(views)) if k < i or (k > i and turn)])
-            seen = Surroundings.from_states(cells, grid, others, stretch)
-            chosen[i] = int((priors[i] + seen.evidence_in(states[i]) / EVIDENCE_SCALE).argmax())
+            others = agreed([k for k in range(len(views)) if k < i or (k > i and turn)])
+            chosen[i] = int((priors[i] + others.log_chance_of(states[i], sizes[i])).argmax())
     known = model.templates[0].xyzrgb
     typical = np.median([_colour_difference(known, views[i], poses[i][chosen[i]]) for i in range(1, len(views))])
     if typical < KEPT_COLOUR_M:
@@ -166,16 +197,32 @@ def _aligned(
             )
             one = Registration(pose, fitness, similar, one.template)
         aligned.append(one)
-    agreed = np.array([states[k][chosen[k]] for k in range(len(views))])
-    return aligned, replace(model, surroundings=Surroundings.from_states(cells, grid, agreed, stretch))
+    if near.max() > MIN_NEAR:
+        pairs = zip(aligned, hands, strict=True)
+        loss = np.array([_hand_loss(one.pose[None], hands[0], places, near)[0] for one, places in pairs])
+        gone = loss > GONE * MAX_HAND_LOSS * near.sum()
+        if gone.mean() <= MAX_MISSING and np.median(loss) < HELD * MAX_HAND_LOSS * near.sum():
+            aligned = [replace(one, fitness=0.0) if lost else one for one, lost in zip(aligned, gone, strict=True)]
+    return aligned, replace(model, surroundings=agreed(range(len(views))))
+
+
+def _hand_loss(motions: FloatArray, shown: FloatArray, hands: FloatArray, near: FloatArray) -> FloatArray:
+    """By how much places ``hands (E, 3)`` of the hand in an image speak against an object's ``motions (C, 4, 4)``: of
+    the logarithm of the chance ``(C,)``. ``shown (E, 3)`` are those in the reference image, which are ``near (E,)`` it.
+    """
+    back = np.linalg.inv(motions)
+    moved = hands @ np.swapaxes(back[:, :3, :3], 1, 2) + back[:, None, :3, 3]
+    squares = ((moved - shown) ** 2).sum(axis=2) / (2 * HAND_SPREAD_M**2)
+    return np.asarray(np.minimum(squares, MAX_HAND_LOSS) @ near)
 
 
 def _with_surroundings(thing: RigidObject, views: Sequence[View]) -> RigidObject:
     """``thing`` with what the ``views`` show around it."""
     if thing.model.parent >= 0 or thing.model.surroundings is None:
         return replace(thing, model=replace(thing.model, surroundings=None))
-    motions = [one.motion for one in thing.registrations]
-    seen = Surroundings.of(thing.points, views, motions, thing.model.varies)
+    showing = np.flatnonzero(thing.shown).tolist()
+    motions = [thing.registrations[i].motion for i in showing]
+    seen = Surroundings.of(thing.points, [views[i] for i in showing], motions, thing.model.varies)
     return replace(thing, model=replace(thing.model, surroundings=seen))
 
 
@@ -230,8 +277,11 @@ def _split(
             pairs.append((rest, register(part_model.templates, view, taken, parent=rest.pose)))
             if pairs[-1][1].fitness < MIN_FITNESS:
                 break
-        fitness = [own.fitness for _, own in pairs]
-        if min(fitness) < MIN_FITNESS or np.median(fitness) < SAME_THING_FITNESS:
+        of_rest, of_part, of_whole = ([one.fitness for one in row] for row in (*zip(*pairs, strict=True), found))
+        if min(of_part) < MIN_FITNESS or np.median(of_part) < SAME_THING_FITNESS:
+            continue
+        # Two motions explain the images better than one, or the part follows noise.
+        if part.mean() * np.mean(of_part) + (1 - part.mean()) * np.mean(of_rest) < np.mean(of_whole):
             continue
         share, metres = gain(home.points[piece[part]], views, motions, [own.pose for _, own in pairs])
         # Not the largest share, which half of the part has as well as all of it.
@@ -255,6 +305,8 @@ def _complete(
     templates = list(model.templates)
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
         rank = [(k in handled and one.fitness > SAME_THING_FITNESS, one.score) for k, one in enumerate(found[i])]
+        if number in handled and not registrations[i].fitness:
+            continue
         better = [k for k in range(len(models)) if rank[k] > rank[number]]
         taken = explained(models, found[i], better)
         start = registrations[i].pose[None]
@@ -265,7 +317,8 @@ def _complete(
             grown = [*models[:number], replace(model, templates=tuple(templates)), *models[number + 1 :]]
             registrations[i] = register_model(grown, number, views[i], found[i], taken, start)
         others = explained(models, found[i], [k for k in range(len(models)) if k != number])
-        templates += another_template(views[i], registrations[i], templates, others, seed)
+        if registrations[i].fitness >= MIN_FITNESS:
+            templates += another_template(views[i], registrations[i], templates, others, seed)
     return RigidObject(replace(model, templates=tuple(templates)), tuple(registrations))
 
 

@@ -31,7 +31,7 @@ def candidate_parts(
     """Parts ``(N,)`` of a ``piece (N,)`` of the image ``home`` that may move against the rest: those that the
     ``motions`` of the whole into each of ``views`` leave off the surfaces there, and those of these that are thin.
     """
-    distances = _distances(home.points[piece], views, motions)
+    distances = surface_distances(home.points[piece], views, motions)
     parts = [*_connected(home, piece, _thin(home, piece)), *_connected(home, piece, distances > UNEXPLAINED_M)[:1]]
     return [part for part in parts if part.sum() <= len(piece) / 2 and distances[part].mean() > MIN_DISTANCE_M]
 
@@ -63,11 +63,11 @@ def gain(
     """By how much the distances of a part's ``points (N, 3)`` from the surfaces in ``views`` become smaller with its
     ``own`` motions than with those of the ``whole``: as a share, and in all, metres.
     """
-    before, after = (_distances(points, views, motions) for motions in (whole, own))
+    before, after = (surface_distances(points, views, motions) for motions in (whole, own))
     return 1 - float(after.mean() / before.mean()), float((before - after).sum())
 
 
-def _distances(points: FloatArray, views: Sequence[View], poses: Sequence[FloatArray]) -> FloatArray:
+def surface_distances(points: FloatArray, views: Sequence[View], poses: Sequence[FloatArray]) -> FloatArray:
     """`PERCENTILE` over ``views`` of the distances ``(N,)`` of moved ``points (N, 3)`` from the surfaces there, metres.
 
     Smoothed over neighbours; views that do not show a point do not count.

@@ -20,8 +20,9 @@ MIN_EXPLAINED = 0.8  # of the variance of a turning point, by what else does not
 STILL_M = 0.010  # by which scenery seems to move between images
 
 
-def relevances(objects: Sequence[Sequence[FloatArray]], trajectories: Sequence[Trajectory]) -> FloatArray:
-    """Relevance ``(O,)`` of ``objects``, each given by its points ``(N, 3)`` in every demonstration, metres, world.
+def relevances(objects: Sequence[Sequence[FloatArray | None]], trajectories: Sequence[Trajectory]) -> FloatArray:
+    """Relevance ``(O,)`` of ``objects``, each given by its points ``(N, 3)`` in every demonstration, metres, world, or
+    None in one that does not show it.
 
     Over the hand's events (`_events`) the sum of its nearness to the object or, if that is more, of the share of the
     variance of the hand's place that the object's place explains. It is 0 for an object that is neither the most
@@ -29,7 +30,10 @@ def relevances(objects: Sequence[Sequence[FloatArray]], trajectories: Sequence[T
     that is how a held tool is moved to a thing that the hand never comes near.
     """
     scenes = zip(*objects, strict=True)
-    events = [_events(points, path) for points, path in zip(scenes, trajectories, strict=True)]
+    events = [
+        _events([one for one in points if one is not None], path)
+        for points, path in zip(scenes, trajectories, strict=True)
+    ]
     hands = _corresponding(events)
     of_events = np.array([_relevances(points, hands) for points in objects])
     total = of_events.sum(axis=1)
@@ -48,6 +52,23 @@ def hand_places(views: Sequence[View], trajectories: Sequence[Trajectory]) -> Fl
         world = transform_points(view.to_world, view.points)
         places.append(transform_points(invert_pose(view.to_world), _events([world], path)))
     return _corresponding(places)
+
+
+def reference(views: Sequence[View], hands: FloatArray) -> int:
+    """Number of the demonstration whose image the objects are taken from: the first, unless nothing is there where the
+    hand (`hand_places`) takes something in most of the others; then the one that shows most there.
+    """
+    distances = np.array([cKDTree(view.points).query(places)[0] for view, places in zip(views, hands, strict=True)])
+    event = int(np.median(distances, axis=0).argmin())
+    taken = distances[:, event]
+    typical = float(np.median(taken))
+    if taken[0] < max(CONTACT_M, 2 * typical):
+        return 0
+    near = [
+        np.linalg.norm(view.points - places[event], axis=1) < 2 * CONTACT_M
+        for view, places in zip(views, hands, strict=True)
+    ]
+    return int(np.argmax([which.sum() * (distance <= typical) for which, distance in zip(near, taken, strict=True)]))
 
 
 def _corresponding(events: Sequence[FloatArray]) -> FloatArray:
@@ -104,21 +125,28 @@ def _turns(path: Trajectory) -> FloatArray:
     return np.array(places)
 
 
-def _relevances(points: Sequence[FloatArray], hands: FloatArray) -> FloatArray:
+def _relevances(points: Sequence[FloatArray | None], hands: FloatArray) -> FloatArray:
     """``(E,)`` of an object with ``points (N, 3)`` in each of I demonstrations, for the hand's ``hands (I, E, 3)``."""
-    distances = _distances(points, hands)
+    distances = _distances(*_where_shown(points, hands))
     near = np.exp(-((distances / CONTACT_M) ** 2)).mean(axis=0)  # what only some demonstrations grasp matters, too
     return np.maximum(near, _related(points, hands))
 
 
-def _related(points: Sequence[FloatArray], hands: FloatArray, least: float = 0.0) -> FloatArray:
+def _where_shown(points: Sequence[FloatArray | None], hands: FloatArray) -> tuple[list[FloatArray], FloatArray]:
+    """The ``points`` of an object and the ``hands (I, E, 3)`` in the demonstrations that show it."""
+    pairs = [(one, at) for one, at in zip(points, hands, strict=True) if one is not None]
+    return [one for one, _ in pairs], np.array([at for _, at in pairs])
+
+
+def _related(points: Sequence[FloatArray | None], hands: FloatArray, least: float = 0.0) -> FloatArray:
     """``(E,)``: share of the variance of ``hands (I, E, 3)`` that the object's place explains, if it is at ``least``
     so much, less the farther they are from it."""
-    centres = np.array([one.mean(axis=0) for one in points])
+    places, hands = _where_shown(points, hands)
+    centres = np.array([one.mean(axis=0) for one in places])
     spread = hands.var(axis=0).sum(axis=-1)
     left = (hands - centres[:, None]).var(axis=0).sum(axis=-1)
     explained = np.where(spread > MIN_SPREAD_M**2, 1 - left / np.maximum(spread, MIN_SPREAD_M**2), 0)
-    distance = np.median(_distances(points, hands), axis=0)
+    distance = np.median(_distances(places, hands), axis=0)
     return np.clip(explained, 0, 1) * (explained >= least) * np.exp(-((distance / RELATED_M) ** 2))
 
 

@@ -36,7 +36,9 @@ def select_points(
     pixels = project(points, home.observation.intrinsics, home.observation.camera_pose)
     seen = np.zeros(len(points))
     has_depth = np.ones(len(points), dtype=bool)
-    for view, registration in zip(views, thing.registrations, strict=True):
+    for view, registration, shown in zip(views, thing.registrations, thing.shown, strict=True):
+        if not shown:
+            continue
         expected = transform_points(registration.motion, points)
         seen += cKDTree(view.points).query(expected)[0] < SEEN_M
         has_depth &= lift_to_surface(view.observation, view.depth, expected)[2]

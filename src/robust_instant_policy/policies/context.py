@@ -26,13 +26,13 @@ HARDLY_RECOGNISED = "the scene was hardly recognised; is everything there that w
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What every method over keypoints starts from, made from ``demonstrations``.
+    """What every method over keypoints starts from, made from N ``demonstrations``.
 
-    ``keypoints (I, K, 3)``, metres, world, and ``pixels (I, K, 2)`` (u, v) of the I demonstrations (no pixels, and no
-    ``extractor``, where the keypoints were given); their downsampled ``trajectories``; the ``prompt`` that serialises
-    both; the ``report`` of what was checked; the ``surroundings`` of the gripper; ``prediction_errors (I, S)`` in
-    metres, see `leave_one_out`; ``notes`` for the user, one line each; the ``pace`` of demonstrations whose rate is
-    known.
+    ``keypoints (I, K, 3)``, metres, world, and downsampled ``trajectories`` of those I that show all objects with
+    keypoints; ``pixels (N, K, 2)`` (u, v) of all (no pixels, and no ``extractor``, where the keypoints were given); the
+    ``prompt`` that serialises both; the ``report`` of what was checked; the ``surroundings`` of the
+    gripper; ``prediction_errors (I, S)`` in metres, see `leave_one_out`; ``notes`` for the user, one line each; the
+    ``pace`` of demonstrations whose rate is known.
     """
 
     demonstrations: tuple[Demonstration, ...]
@@ -86,8 +86,10 @@ def build_context(
     report.raise_if_wrong()
     progress("keypoints", 0, 0)
     extractor = _extractor(demonstrations, settings)
-    trajectories = [one.trajectory for one in demonstrations]
-    return _context(extractor.keypoints_, trajectories, settings, report, demonstrations, extractor)
+    kept = [i for i, left_out in enumerate(extractor.left_out_) if not left_out]
+    trajectories = [demonstrations[i].trajectory for i in kept]
+    observations = [demonstrations[i].observation for i in kept]
+    return _context(extractor.keypoints_[kept], trajectories, settings, report, observations, demonstrations, extractor)
 
 
 def _extractor(demonstrations: Sequence[Demonstration], settings: Settings) -> KeypointExtractor | OwnKeypoints:
@@ -117,14 +119,17 @@ def _context(
     trajectories: Sequence[Trajectory],
     settings: Settings,
     report: SetReport,
+    observations: Sequence[Observation] = (),
     demonstrations: Sequence[Demonstration] = (),
     extractor: KeypointExtractor | OwnKeypoints | None = None,
 ) -> Context:
-    """Thin the ``trajectories`` out and serialise them; with ``demonstrations`` where there is more than these."""
+    """Thin the ``trajectories`` out and serialise them; with their ``observations`` and all ``demonstrations`` where
+    there is more than these.
+    """
     thinned = tuple(downsample(one, settings.downsampling, settings.num_steps) for one in trajectories)
     prompt = write_prompt(keypoints, thinned, settings.frames, settings.layout)
     aligned = prompt.aligned
-    views = [View.of(demonstrations[index].observation) for index in aligned.kept] if demonstrations else []
+    views = [View.of(observations[index]) for index in aligned.kept] if observations else []
     return Context(
         tuple(demonstrations),
         extractor,
@@ -158,5 +163,6 @@ def locate(context: Context, observation: Observation, progress: Progress = no_p
     with watch.stage("keypoints"):
         findings = context.report.require_observation(observation)
         located = context.extractor.locate(observation)
-    recognised = recognition(context.extractor.confidence_, located.confidence)
+    extractor = context.extractor
+    recognised = recognition(extractor.confidence_[~extractor.left_out_], located.confidence)
     return LocatedScene(located, watch.stages[0], findings, View.of(observation), recognised)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError, UsageError
@@ -61,6 +61,7 @@ class OwnKeypoints:
         for index, points in enumerate(self.keypoints_):
             self._require_all(points, f"demonstration {index}")
         self.pixels_ = np.stack([_pixels(points, scene) for points, scene in zip(keypoints, scenes, strict=True)])
+        self.left_out_: NDArray[np.bool_] = np.zeros(len(scenes), dtype=bool)
         self.notes_ = (f"keypoints: {self.name}, {self.keypoints_.shape[1]} points",)
         return self
 
