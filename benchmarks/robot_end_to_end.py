@@ -48,6 +48,7 @@ from robust_instant_policy.robots.leaders import make_leader
 from robust_instant_policy.robots.operator import ENTER
 from robust_instant_policy.robots.path import MeasuredPath
 from robust_instant_policy.robots.priority import DEVICE, take_real_time
+from robust_instant_policy.robots.recording import jitter_95_ms
 from robust_instant_policy.robots.session import Session
 from robust_instant_policy.robots.signals import StopRequest
 from robust_instant_policy.robots.station import Station
@@ -241,8 +242,8 @@ def run_scene(
         raise SystemExit(f"rip run failed in scene {index}: {done.stderr.strip()}")
     if (out / MEASURED_FILE).exists():
         path = MeasuredPath.load(out / MEASURED_FILE)
-        row["jitter_95_ms"] = 1e3 * float(np.percentile(path.jitter, 95))
-        row["following_rad"] = path.worst_following_error
+        row["jitter_95_ms"] = jitter_95_ms(path.seconds, path.rate_hz)
+        row["following_rad"] = float(path.joint_errors.max(initial=0.0))
     outcome = RunRecord.load(out)
     plan = Plan.load(out / PLAN_FILE)
     return row | {"cell": bool(outcome.success), "outcome": outcome.outcome, "simulator": simulated(task, seed, plan)}

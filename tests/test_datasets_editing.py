@@ -7,7 +7,7 @@ import pytest
 
 from robust_instant_policy import files
 from robust_instant_policy.cli import main
-from robust_instant_policy.datasets import DatasetWriter, editing, load_demonstrations, load_frames
+from robust_instant_policy.datasets import DatasetWriter, card, load_demonstrations, load_frames
 from robust_instant_policy.datasets.editing import delete, merge, restore, split
 from robust_instant_policy.errors import DatasetError
 from tests.datasets_samples import DESCRIPTION, RATE_HZ, TASK, demonstration, images
@@ -132,7 +132,7 @@ def test_an_interrupted_edit_leaves_nothing_behind_and_can_be_repeated(tmp_path,
             pressed.append(path)
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(editing, "write_whole", press)
+    monkeypatch.setattr(card, "write_whole", press)
     before = sorted(tmp_path.iterdir())
     with pytest.raises(KeyboardInterrupt):
         split(whole, [1, 2], outs)

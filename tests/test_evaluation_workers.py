@@ -35,7 +35,6 @@ from robust_instant_policy.evaluation import (
     run_suites,
     scene_seed,
 )
-from robust_instant_policy.evaluation.cluster import RayWorkers
 from robust_instant_policy.evaluation.failures import FailureAnalysis, film, true_keypoints, video_file
 from robust_instant_policy.evaluation.processes import LocalWorkers
 from robust_instant_policy.evaluation.work import Planned, SceneWork
@@ -214,6 +213,8 @@ def test_workers_end_at_once_with_the_evaluation_that_was_killed(tmp_path):
 
 def test_a_ray_cluster_on_which_a_worker_is_killed_writes_the_rows_that_a_process_writes(recorded, reach, tmp_path):
     pytest.importorskip("ray")
+    from robust_instant_policy.evaluation.cluster import RayWorkers
+
     killed = []
 
     def kill_one(done: int, total: int, what) -> None:

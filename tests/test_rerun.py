@@ -11,13 +11,14 @@ from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import RipError
 from robust_instant_policy.policies import Neighbours
-from robust_instant_policy.reporting.rerun_log import open_recording
 from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_FILE, RunRecord, save_context
 from robust_instant_policy.robots.path import MeasuredPath
 
 pytest.importorskip("rerun")
 import rerun as rr
 from rerun.chunk import RrdReader
+
+from robust_instant_policy.reporting.rerun_log import open_recording
 
 LIFTED = np.array([0, 0, 0.005])
 

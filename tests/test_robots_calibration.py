@@ -1,6 +1,7 @@
 """Calibration recovers known cameras and tools from computed photographs and touches, and names the usual mistakes."""
 
-from dataclasses import replace
+import tomllib
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from robust_instant_policy.errors import CalibrationError, RobotError
 from robust_instant_policy.geometry import invert_pose, make_pose, transform_points
 from robust_instant_policy.robots.calibration import (
     Board,
-    CameraCalibration,
     calibrate_tool,
     check_camera,
     in_hand,
@@ -96,10 +96,8 @@ def test_a_calibration_file_is_read_back_and_serves_the_cell(table, tmp_path):
     frames, touched = table
     result = on_table("realsense 1", frames, BOARD, touched_place(touched, BOARD))
     result.save(tmp_path / "camera.toml")
-    again = CameraCalibration.load(tmp_path / "camera.toml")
-    np.testing.assert_array_equal(again.pose, result.pose)
     np.testing.assert_array_equal(read_camera_pose(tmp_path / "camera.toml"), result.pose)
-    assert again.board == BOARD
+    assert tomllib.loads((tmp_path / "camera.toml").read_text())["board"] == asdict(BOARD)
     check_camera(tmp_path / "camera.toml", "realsense 1", frames[0])
     with pytest.raises(RobotError, match="realsense 2 is connected; run rip calibrate camera"):
         check_camera(tmp_path / "camera.toml", "realsense 2", frames[0])
@@ -224,7 +222,7 @@ def test_touching_a_point_with_both_fingers_gives_the_tool_frame_and_the_opening
     assert result.opening == pytest.approx(0.07, abs=0.001)
     assert max(result.left_out_mm) < 2.0
     result.save(tmp_path / "gripper.toml")
-    assert read_gripper(tmp_path / "gripper.toml").length == pytest.approx(0.1567, abs=0.001)
+    assert read_gripper(tmp_path / "gripper.toml")[0].length == pytest.approx(0.1567, abs=0.001)
 
 
 def test_touches_that_do_not_determine_the_tip_are_told():

@@ -65,7 +65,7 @@ def test_a_plan_is_executed_as_planned_and_a_grasp_of_nothing_is_told(emulated):
     assert len(path.seconds) == len(motion.joints)
     sent = emulation.commands()
     np.testing.assert_allclose(sent[-1, 0, :6], motion.joints[-1, 0], atol=2e-3)  # of the servos' resolution
-    assert path.worst_following_error < 0.1
+    assert path.joint_errors.max() < 0.1
     assert np.linalg.norm(path.measured_tools[-1, 0] - PICK[-1]) < 5e-3
     (line,) = path.empty_grasps(["left"])
     assert "the gripper left closed on nothing" in line

@@ -16,12 +16,11 @@ from websockets.sync.client import connect
 
 from robust_instant_policy.checks import is_trusted
 from robust_instant_policy.cli import main
-from robust_instant_policy.datasets.images import encode_depth, encode_png
+from robust_instant_policy.datasets.images import encode_depth, encode_image
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import UsageError
-from robust_instant_policy.network import listen
+from robust_instant_policy.network import checked_key, listen
 from robust_instant_policy.policies import Neighbours
-from robust_instant_policy.serving.address import checked_key
 from robust_instant_policy.serving.messages import pack, unpack
 from robust_instant_policy.serving.planner import Planner
 from robust_instant_policy.serving.server import serve
@@ -90,7 +89,7 @@ def as_map(observation, **others):
 def as_json(observation, **others):
     depth, unit = encode_depth(observation.depth)
     return {
-        "rgb": base64.b64encode(encode_png(observation.rgb)).decode(),
+        "rgb": base64.b64encode(encode_image(observation.rgb)).decode(),
         "depth": base64.b64encode(depth).decode(),
         "depth_unit_m": unit,
         "intrinsics": observation.intrinsics.tolist(),

@@ -378,7 +378,7 @@ def test_keys_move_either_of_two_arms(studio):
 
 
 def test_the_t_regression_ignores_a_candidate_that_is_dragged_away_and_the_gaussian_follows_it(context, workbench):
-    from robust_instant_policy.studio.drawing import spread, tool_path
+    from robust_instant_policy.studio.drawing import spread
     from robust_instant_policy.studio.planner import Choices, Draft
 
     settings = Settings()
@@ -389,7 +389,7 @@ def test_the_t_regression_ignores_a_candidate_that_is_dragged_away_and_the_gauss
 
     def moved(trajectory: Callable) -> float:
         """How far the ``trajectory`` follows from ``far`` to ``farther``, metres."""
-        one, other = (tool_path(trajectory(choices), 0) for choices in (far, farther))
+        one, other = (trajectory(choices).tool_points[:, 0] for choices in (far, farther))
         return float(np.linalg.norm(other - one, axis=1).max())
 
     assert moved(draft.gaussian) > 0.02

@@ -1,4 +1,4 @@
-"""Checks of numbers that come from outside: one clear line where they are given."""
+"""Checks of numbers from the caller; errors in one line."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ import importlib
 import io
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from robust_instant_policy import __version__
 from robust_instant_policy.errors import RipError
@@ -79,9 +80,18 @@ def _main(arguments: list[str]) -> int:
         return 1
 
 
+class CommandParser(argparse.ArgumentParser):
+    """Its help tells the default of each option that has one."""
+
+    def add_argument(self, *names: Any, **settings: Any) -> argparse.Action:
+        if settings.get("default") not in (None, argparse.SUPPRESS):
+            settings["help"] += " (default: %(default)s)"
+        return super().add_argument(*names, **settings)
+
+
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """The options of a command line, with the command's function as ``run``; exits with a message for a wrong one."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="rip", description="Robust Instant Policy: show a robot a task a few times; it does it at once."
     )
     parser.add_argument("--version", action="version", version=f"rip {__version__}")

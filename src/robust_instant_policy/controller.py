@@ -1,4 +1,4 @@
-"""A policy in closed loop, as tasks and methods both see it: tasks know no method, methods know no task."""
+"""The interface between a closed-loop policy and a task."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from robust_instant_policy.geometry import FloatArray
 
 
 class Controller(Protocol):
-    """A policy in closed loop: it looks again while it moves."""
+    """A closed-loop policy: it gets new images while it moves."""
 
     @property
     def rate_hz(self) -> float | None:

@@ -1,8 +1,7 @@
-"""What the camera saw and what the person did."""
+"""An RGB-D observation, and a demonstration."""
 
 from __future__ import annotations
 
-import io
 import math
 import zipfile
 import zlib
@@ -11,15 +10,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from tokenize import TokenError
 from types import MappingProxyType
+from typing import BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from robust_instant_policy.checks import checked_array, checked_pose
+from robust_instant_policy.checks import checked_array, checked_pose, checked_positive
 from robust_instant_policy.errors import DatasetError, InvalidValueError
-from robust_instant_policy.files import open_regular, write_whole
-from robust_instant_policy.geometry import FloatArray, as_numbers
+from robust_instant_policy.files import npz, open_regular, write_whole
+from robust_instant_policy.geometry import FloatArray, as_numbers, lift
 from robust_instant_policy.trajectory import Trajectory
 
 FARTHEST_CAMERA_M = 50.0  # from the origin of the world; farther, it is not in metres
@@ -58,14 +58,19 @@ class Observation:
         camera_pose = checked_pose("camera_pose", self.camera_pose)
         if np.abs(camera_pose[:3, 3]).max() > FARTHEST_CAMERA_M:
             raise InvalidValueError(f"camera_pose puts the camera at {camera_pose[:3, 3]}; is that in metres?")
-        for name, value in (
-            ("rgb", rgb),
-            ("depth", depth),
-            ("intrinsics", intrinsics),
-            ("camera_pose", camera_pose),
-        ):
+        arrays: tuple[NDArray, ...] = (rgb, depth, intrinsics, camera_pose)
+        for name, value in zip(ARRAYS, arrays, strict=True):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
+
+    def points(self, most: int | None = None) -> tuple[FloatArray, NDArray[np.uint8]]:
+        """The points ``(N, 3)`` of all pixels with depth, metres, world, and their colours ``(N, 3)``; evenly thinned
+        out to at ``most`` so many."""
+        rows, columns = np.nonzero(self.depth > 0)
+        every = 1 if most is None else max(1, -(-len(rows) // most))
+        rows, columns = rows[::every], columns[::every]
+        pixels = np.column_stack([columns, rows])
+        return lift(pixels, self.depth[rows, columns], self.intrinsics, self.camera_pose), self.rgb[rows, columns]
 
     @classmethod
     def load(cls, path: str | Path) -> Observation:
@@ -74,27 +79,34 @@ class Observation:
         What the file declares is checked before memory is reserved for it; nothing is unpickled.
         """
         try:
-            with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-                missing = [name for name in ARRAYS if f"{name}.npy" not in archive.namelist()]
-                if missing:
-                    raise DatasetError(
-                        f"{path} lacks {', '.join(missing)}; an observation is an .npz with {', '.join(ARRAYS)}"
-                    )
-                return cls(*(_read_array(archive, name) for name in ARRAYS))
+            with open_regular(path) as file:
+                return cls.read(file, path)
         except FileNotFoundError:
             raise DatasetError(f"no observation at {path}") from None
+
+    @classmethod
+    def read(cls, file: BinaryIO, name: str | Path) -> Observation:
+        """`load` from an open ``.npz`` file, called ``name`` in errors."""
+        try:
+            with zipfile.ZipFile(file) as archive:
+                missing = [array for array in ARRAYS if f"{array}.npy" not in archive.namelist()]
+                if missing:
+                    raise DatasetError(
+                        f"{name} lacks {', '.join(missing)}; an observation is an .npz with {', '.join(ARRAYS)}"
+                    )
+                return cls(*(_read_array(archive, array) for array in ARRAYS))
         except InvalidValueError as error:
-            raise DatasetError(f"{path}: {error}") from None
+            raise DatasetError(f"{name}: {error}") from None
         except UNREADABLE_NPZ:
-            raise DatasetError(f"{path} is not an .npz file with {', '.join(ARRAYS)}") from None
+            raise DatasetError(f"{name} is not an .npz file with {', '.join(ARRAYS)}") from None
 
     def save(self, path: str | Path) -> None:
         """Write the observation as an ``.npz`` file that `load` reads."""
-        buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer, rgb=self.rgb, depth=self.depth, intrinsics=self.intrinsics, camera_pose=self.camera_pose
-        )
-        write_whole(Path(path), buffer.getvalue())
+        write_whole(Path(path), self.npz())
+
+    def npz(self) -> bytes:
+        """The content of such a file."""
+        return npz({name: getattr(self, name) for name in ARRAYS})
 
 
 def _check_intrinsics(intrinsics: FloatArray, height: int, width: int) -> None:
@@ -165,9 +177,7 @@ class Demonstration:
     frames: Callable[[], Iterator[NDArray[np.uint8]]] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        rate = self.rate_hz
-        if isinstance(rate, bool) or not isinstance(rate, int | float | np.number) or not 0 < rate < np.inf:
-            raise InvalidValueError(f"rate_hz must be a positive number of Hz, got {rate!r}")
+        checked_positive("rate_hz", self.rate_hz)
 
     @property
     def seconds(self) -> float:

@@ -6,7 +6,8 @@ The command turns them into exit codes: 2 for wrong usage, 1 for everything else
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class RipError(Exception):
@@ -37,6 +38,20 @@ class MissingExtraError(RipError):
         self.package, self.extra = package, extra
 
 
+@contextmanager
+def needs_extra(extra: str, library: str | None = None) -> Iterator[None]:
+    """Raises `MissingExtraError` for a package that the ``with`` block imports and that is not installed, and
+    `RobotError` for one that is, but cannot be loaded without ``library``, a package of Debian."""
+    try:
+        yield
+    except ImportError as error:
+        if library is not None and not isinstance(error, ModuleNotFoundError):
+            raise RobotError(f"a system library is missing: {error}; on Debian: apt install {library}") from error
+        if error.name is None or error.name.startswith("robust_instant_policy"):
+            raise
+        raise MissingExtraError(error.name, extra) from error
+
+
 def install_command(extra: str) -> str:
     """What installs an extra. Simulators that require packages which are too old, or are not there for Python 3.13, are
     installed without them."""
@@ -48,7 +63,7 @@ def install_command(extra: str) -> str:
 
 
 class MissingMethodError(UsageError):
-    """A task of one's own that lacks an optional method."""
+    """A user's task that lacks an optional method."""
 
     def __init__(self, task: str, method: str, purpose: str):
         super().__init__(f"the task {task} has no {method}(), which is needed {purpose} (docs/own-tasks.md)")

@@ -7,6 +7,7 @@ import errno
 import fcntl
 import grp
 import hashlib
+import io
 import json
 import os
 import pwd
@@ -14,9 +15,13 @@ import secrets
 import shutil
 import stat
 import sys
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robust_instant_policy.errors import DatasetError
 
@@ -80,7 +85,7 @@ def read_json(path: str | Path, kind: str = "a JSON object") -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What ``text`` from outside holds. Raises `ValueError`, also for deep nesting and for integers beyond a float."""
+    """Parse JSON from outside. Raises `ValueError`, also for deep nesting and for integers beyond a float."""
     try:
         return json.loads(text, parse_int=_whole)
     except RecursionError:
@@ -93,6 +98,27 @@ def _whole(digits: str) -> int:
     return int(digits)
 
 
+def npz(arrays: Mapping[str, object]) -> bytes:
+    """The content of a compressed ``.npz`` file."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    return buffer.getvalue()
+
+
+def load_arrays(path: Path, names: Collection[str], advice: str) -> dict[str, NDArray]:
+    """The arrays of an ``.npz`` file, ``names`` among them. Raises `DatasetError` that ends with the ``advice``."""
+    try:
+        with open_regular(path) as file, np.load(file, allow_pickle=False) as archive:
+            arrays = dict(archive)
+        if lacking := [name for name in names if name not in arrays]:
+            raise ValueError(f"it lacks {', '.join(lacking)}")
+        return arrays
+    except FileNotFoundError:
+        raise DatasetError(f"{path} is missing; {advice}") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise DatasetError(f"{path} is damaged ({error}); {advice}") from None
+
+
 def sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -101,8 +127,8 @@ def sha256(path: Path) -> str:
 def others_can_write(path: Path, in_own_group: bool = True) -> bool:
     """Whether another user could exchange a file, or one in a folder, between its check and its use.
 
-    Many systems make files writable for a group of which their owner is the only member; without ``in_own_group`` that
-    counts as nobody.
+    Many systems make files writable for a group of which their owner is the only member; without ``in_own_group`` such
+    a group is ignored.
     """
     status = path.stat()
     if status.st_uid not in (0, os.geteuid()) or status.st_mode & stat.S_IWOTH:
@@ -131,7 +157,7 @@ def _require_regular(path: str | Path, mode: int) -> None:
 
 
 def excerpt(said: str | Path | Exception) -> str:
-    """What a file or an error says, on one line of at most `MAX_EXCERPT` characters."""
+    """Text of a file or an error on one line of at most `MAX_EXCERPT` characters."""
     text = " ".join(str(said).split())
     return text if len(text) <= MAX_EXCERPT else text[:MAX_EXCERPT] + "…"
 
@@ -212,7 +238,7 @@ def finished_files(path: Path) -> Iterator[Path]:
 
 
 def write_error(path: Path, error: OSError) -> DatasetError:
-    """What to tell the user when ``path`` could not be written."""
+    """The error for a file ``path`` that could not be written."""
     if error.errno in NO_SPACE:
         return DatasetError(
             f"no space left to write {path}; episodes recorded so far are safe: free some space and run the same again"

@@ -1,4 +1,4 @@
-"""Ctrl-C that is not lost.
+"""Handling of Ctrl-C so that none is lost.
 
 Python prints and drops a `KeyboardInterrupt` that is raised inside a destructor, a callback of a weak reference
 (imports have many) or a callback of a C library. So each Ctrl-C is noted, too, and raised again by `raise_pending`.
@@ -35,7 +35,17 @@ def noted_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@contextmanager
+def blocked(*numbers: signal.Signals) -> Iterator[None]:
+    """Signals of ``numbers`` wait until the end of the context; processes that start within it inherit that."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def raise_pending() -> None:
-    """Raise `KeyboardInterrupt` if there was a Ctrl-C that nobody caught."""
+    """Raise `KeyboardInterrupt` if a Ctrl-C was noted but dropped."""
     if _pending.is_set():
         raise KeyboardInterrupt

@@ -7,6 +7,7 @@ import re
 import sys
 from importlib import import_module
 from importlib.metadata import entry_points
+from types import ModuleType
 
 from robust_instant_policy.errors import UsageError
 
@@ -23,16 +24,21 @@ def registered(group: str) -> dict[str, str]:
     return {point.name: point.value for point in entry_points(group=group)}
 
 
+def own_module(name: str) -> ModuleType:
+    """A module that is installed or lies in the working directory. It runs the module's code, see `load_class`."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    return import_module(name)
+
+
 def load_class(kind: str, spec: str) -> type:
     """The class ``module:Class``, where the module is installed or lies in the working directory.
 
     It runs the module's code, so ``spec`` must come from the user, never from a file. Raises `UsageError`.
     """
     module_name, _, class_name = spec.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
     try:
-        module = import_module(module_name)
+        module = own_module(module_name)
     except ModuleNotFoundError as error:
         if error.name and (module_name == error.name or module_name.startswith(f"{error.name}.")):
             problem = f"there is no module {error.name} in {os.getcwd()} or among the installed packages"

@@ -1,4 +1,4 @@
-"""What is asked of a language model and what it answers.
+"""Queries to a language model and its answers.
 
 `context` writes queries and reads answers, `llm` sends them; neither imports the other.
 """

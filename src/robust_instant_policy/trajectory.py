@@ -91,6 +91,11 @@ class Trajectory:
         )
 
     @property
+    def tool_points(self) -> FloatArray:
+        """Points midway between the fingertips ``(T, A, 3)``, metres, world frame."""
+        return self.triplets[:, :, 1:].mean(axis=2)
+
+    @property
     def gripper_state(self) -> FloatArray:
         """Gripper state ``(T, A)``: 0 open, 1 closed."""
         return self.actions[:, STATE_INDEX::ACTION_DIM]

@@ -30,6 +30,7 @@ from robust_instant_policy.robots.calibration.guided import Guide, copied_turns,
 from robust_instant_policy.robots.camera import Camera
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.device import connected
 from robust_instant_policy.robots.emulation.client import devices_of
 from robust_instant_policy.robots.execution import park
 from robust_instant_policy.robots.leaders import joint_source, make_leader
@@ -45,21 +46,17 @@ DIRECTIONS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(required=True, metavar="WHAT")
     usual = Board()
-    board = argparse.ArgumentParser(add_help=False)
-    board.add_argument("--columns", type=positive, default=usual.columns, help="squares (default: %(default)s)")
-    board.add_argument("--rows", type=positive, default=usual.rows, help="squares (default: %(default)s)")
-    board.add_argument(
-        "--square", type=float, default=usual.square_m, metavar="M", help="edge in metres (default: %(default)s)"
-    )
-    board.add_argument(
-        "--marker", type=float, default=usual.marker_m, metavar="M", help="edge in metres (default: %(default)s)"
-    )
-    board.add_argument("--dictionary", default=usual.dictionary, help="of the markers (default: %(default)s)")
-    cell = argparse.ArgumentParser(add_help=False)
+    board = type(parser)(add_help=False)
+    board.add_argument("--columns", type=positive, default=usual.columns, help="squares")
+    board.add_argument("--rows", type=positive, default=usual.rows, help="squares")
+    board.add_argument("--square", type=float, default=usual.square_m, metavar="M", help="edge in metres")
+    board.add_argument("--marker", type=float, default=usual.marker_m, metavar="M", help="edge in metres")
+    board.add_argument("--dictionary", default=usual.dictionary, help="of the markers")
+    cell = type(parser)(add_help=False)
     cell.add_argument("--robot", type=Path, required=True, metavar="FILE", help="file of the cell")
 
     printed = actions.add_parser("board", parents=[board], help="write the board to print")
-    printed.add_argument("--out", type=Path, default=Path("board.pdf"), help=".pdf or .png (default: %(default)s)")
+    printed.add_argument("--out", type=Path, default=Path("board.pdf"), help=".pdf or .png")
     printed.set_defaults(action=_board)
 
     camera = actions.add_parser("camera", parents=[cell, board], help="camera to world, with a printed board")
@@ -68,8 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--place", type=float, nargs=4, metavar=("X", "Y", "Z", "YAW"),
                      help="corner A of the board, metres in the world, and the direction A to B, degrees")  # fmt: skip
     how.add_argument("--in-hand", metavar="ARM", help="this arm holds the board")
-    camera.add_argument("--places", type=positive, default=6, help="of the board on the table (default: %(default)s)")
-    camera.add_argument("--poses", type=positive, default=12, help="of the board in the hand (default: %(default)s)")
+    camera.add_argument("--places", type=positive, default=6, help="of the board on the table")
+    camera.add_argument("--poses", type=positive, default=12, help="of the board in the hand")
     camera.set_defaults(action=_camera)
 
     tool = actions.add_parser("tool", parents=[cell], help="fingertips and opening of a gripper")
@@ -101,18 +98,14 @@ def _board(options: argparse.Namespace) -> None:
 
 
 def _camera(options: argparse.Namespace) -> None:
-    with _open(options.robot) as cell:
+    with _open(options.robot) as cell, ExitStack() as stack:
         file = cell.config.camera_calibration
         if file is None or cell.config.camera is None:
             raise CellError(f'{options.robot}: give the table [camera] calibration = "camera.toml", the file to write')
         board = _the_board(options)
-        camera = make_camera(cell.config.camera, cell.config.path.parent)
         with cell.terminal.stop.ends_waiting():
-            camera.connect()
-        try:
-            result = _calibrated(options, cell, camera, board)
-        finally:
-            camera.disconnect()
+            camera = stack.enter_context(connected(make_camera(cell.config.camera, cell.config.path.parent)))
+        result = _calibrated(options, cell, camera, board)
     result.save(file)
     print(f"{file}: {result.method}, reprojection error {result.reprojection_px:.2f} px")
     print(f"  left out one by one: {_millimetres(result.left_out_mm)}")
@@ -163,7 +156,7 @@ def _tool(options: argparse.Namespace) -> None:
 
 
 def _leader(options: argparse.Namespace) -> None:
-    with _open(options.robot) as cell:
+    with _open(options.robot) as cell, ExitStack() as stack:
         index = cell.index(options.arm)
         arm = cell.config.arms[index]
         source = joint_source(arm)
@@ -172,13 +165,11 @@ def _leader(options: argparse.Namespace) -> None:
             raise CellError(
                 f'{options.robot}: give the leader of {arm.name} calibration = "leader.toml", the file to write'
             )
-        with ExitStack() as stack:
-            with cell.terminal.stop.ends_waiting():
-                stack.enter_context(cell.station)
-                source.connect()
-                stack.callback(source.disconnect)
-            cell.park()
-            joints = copied_turns(cell.station, source, index, cell.terminal)
+        with cell.terminal.stop.ends_waiting():
+            stack.enter_context(cell.station)
+            stack.enter_context(connected(source))
+        cell.park()
+        joints = copied_turns(cell.station, source, index, cell.terminal)
     joints.save(cell.config.path.parent / str(file))
     print(f"{file}: channels {joints.channels.tolist()}, signs {joints.signs.astype(int).tolist()}")
 
@@ -208,8 +199,7 @@ class _Cell:
         with ExitStack() as stack:
             with self.terminal.stop.ends_waiting():
                 stack.enter_context(self.station)
-                leader.connect()
-                stack.callback(leader.disconnect)
+                stack.enter_context(connected(leader))
             yield Guide(self.station, leader, index, self.terminal)
 
     def park(self) -> None:

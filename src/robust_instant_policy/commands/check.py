@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from robust_instant_policy.commands.options import beside
+from robust_instant_policy.commands.options import add_demos, beside
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.files import write_whole
@@ -14,7 +14,7 @@ from robust_instant_policy.sanity import Finding, check_demonstrations, errors
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
+    add_demos(parser)
     parser.add_argument("--observation", type=Path, metavar="FILE", help="a new scene: .npz, as for rip plan")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR-check.html)")
 

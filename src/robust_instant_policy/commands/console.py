@@ -35,7 +35,9 @@ class StageConsole:
         try:
             yield
         finally:
-            self._clear()
+            if self._bar is not None:
+                self._bar.stop()
+                self._bar = None
         raise_pending()
         seconds = time.perf_counter() - start
         self.stages.append(Stage(name, seconds))
@@ -59,11 +61,6 @@ class StageConsole:
             self._bar.start()
         self._bar.update(self._bar.task_ids[0], description=name, completed=done, total=total or None)
 
-    def _clear(self) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
-
 
 class TrainingScreen:
     """A `policies.training.TrainingReport`: loss and remaining time, as a bar or, without a terminal, as lines."""
@@ -73,13 +70,10 @@ class TrainingScreen:
         self._last_line = -TRAINING_LINE_S
 
     def __call__(self, method: str, done: int, total: int, loss: float, seconds_left: float) -> None:
-        what = f"training {method}: loss {loss:.4f}, {_in_words(seconds_left)} left"
+        left = f"{seconds_left / 60:.0f} min" if seconds_left >= 90 else f"{seconds_left:.0f} s"
+        what = f"training {method}: loss {loss:.4f}, {left} left"
         self._screen.done_so_far(what, done, total)
         now = time.monotonic()
         if not self._screen.console.is_terminal and (now - self._last_line > TRAINING_LINE_S or done == total):
             self._screen.say(f"  {what}, {done} of {total} steps")
             self._last_line = now
-
-
-def _in_words(seconds: float) -> str:
-    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"

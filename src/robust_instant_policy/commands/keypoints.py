@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from functools import partial
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import add_keypoints, add_level, beside, positive, seed
+from robust_instant_policy.commands.options import add_demos, add_keypoints, add_level, beside, positive, seed
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import UsageError
@@ -22,7 +22,6 @@ from robust_instant_policy.perception.accuracy import Accuracy, measure
 from robust_instant_policy.reporting.keypoints import keypoints_page
 from robust_instant_policy.tasks import is_installed, make_task
 from robust_instant_policy.tasks.camera_noise import CameraNoise
-from robust_instant_policy.tasks.level import PAPER
 from robust_instant_policy.tasks.task import require
 
 SAME_DEPTH_M = 0.005  # difference of depth between two renderings of one scene
@@ -32,12 +31,12 @@ Camera = Callable[[Observation, int], Observation]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
+    add_demos(parser)
     parser.add_argument(
         "--task", help="task that the demonstrations are of, if it is not installed: module:Class (default: their own)"
     )
-    parser.add_argument("--scenes", type=positive, default=20, metavar="N", help="new scenes (default: %(default)s)")
-    parser.add_argument("--seed", type=seed, default=0, help="seed of the first new scene (default: %(default)s)")
+    parser.add_argument("--scenes", type=positive, default=20, metavar="N", help="new scenes")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the first new scene")
     add_keypoints(parser, "auto", "registration")
     parser.add_argument("--noise", action="store_true", help="add the noise of a stereo depth camera")
     add_level(parser)
@@ -45,63 +44,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    out = options.out or beside(options.demos, "-keypoints.html")
-    features, correspondence = options.features or "auto", options.keypoints or "registration"
-    extractor = partial(KeypointExtractor, features=features, correspondence=correspondence)
-    show_keypoints(
-        options.demos, extractor, options.scenes, options.noise, options.seed, out, options.level, options.task
-    )
-    return 0
-
-
-def show_keypoints(
-    demos: Path,
-    make_extractor: Callable[..., KeypointExtractor],
-    num_scenes: int,
-    noisy: bool,
-    seed: int,
-    out: Path,
-    level: str = PAPER.name,
-    task_name: str | None = None,
-) -> Path:
-    """Write the page to ``out``.
-
-    For a simulated task (``task_name``, or that of the demonstrations), also compare the keypoints of new scenes with
-    the true positions of the same material points; ``level`` is that of these scenes and of the demonstrations.
-    ``noisy`` adds the depth camera's noise to all images.
-    """
+    """Write the page; for a simulated task also compare the keypoints of new scenes with the true positions of the same
+    material points."""
     screen = StageConsole()
-    demonstrations = load_demonstrations(demos)
-    camera: Camera = CameraNoise().photograph if noisy else lambda seen, _: seen
+    demonstrations = load_demonstrations(options.demos)
+    camera: Camera = CameraNoise().photograph if options.noise else lambda seen, _: seen
     images = [camera(one.observation, NOISE_SEED + index) for index, one in enumerate(demonstrations)]
-    trajectories = [one.trajectory for one in demonstrations]  # they decide where a policy's keypoints lie, too
-    name = task_name or demonstrations[0].task
-    # a class of one's own is loaded where the user names it, never where a dataset does
-    simulated = (task_name or is_installed(name)) and all(one.seed is not None for one in demonstrations)
-    extractor = make_extractor()
+    name = options.task or demonstrations[0].task
+    # A class is loaded only if the user names it; a dataset must not make this package run code.
+    simulated = (options.task or is_installed(name)) and all(one.seed is not None for one in demonstrations)
     scenes: list[Observation] = []
     accuracy = None
-    if simulated:
-        task: Any = make_task(name, level=level)
-        try:
+    with ExitStack() as stack:
+        task: Any = stack.enter_context(closing(make_task(name, level=options.level))) if simulated else None
+        extractor = KeypointExtractor(
+            features=options.features or "auto",
+            correspondence=options.keypoints or "registration",
+            workspace=task.workspace if simulated else None,
+        )
+        if simulated:
             require(task, "scene_truth")
-            extractor = make_extractor(workspace=task.workspace)
-            with screen.stage(f"keypoints of {len(images)} demonstrations"):
-                extractor.fit(images, trajectories)
-            with screen.stage(f"{num_scenes} new scenes"):
-                scenes, accuracy = _compare(task, extractor, demonstrations, camera, num_scenes, seed)
-        finally:
-            task.close()
-        screen.say(f"    {accuracy.summary()}")
-    else:
         with screen.stage(f"keypoints of {len(images)} demonstrations"):
-            extractor.fit(images, trajectories)
-        screen.say("    no errors: the true positions are known for simulated tasks only")
-    for note in extractor.notes_:
-        screen.say(f"    {note}")
+            # The trajectories decide where a policy's keypoints lie, too.
+            extractor.fit(images, [one.trajectory for one in demonstrations])
+        if simulated:
+            with screen.stage(f"{options.scenes} new scenes"):
+                scenes, accuracy = _compare(task, extractor, demonstrations, camera, options.scenes, options.seed)
+    summary = accuracy.summary() if accuracy else "no errors: the true positions are known for simulated tasks only"
+    for line in (summary, *extractor.notes_):
+        screen.say(f"    {line}")
+    out = options.out or beside(options.demos, "-keypoints.html")
     write_whole(out, keypoints_page(extractor, images, scenes, accuracy, f"Keypoints of {name}").encode())
     screen.say(f"page: {out}")
-    return out
+    return 0
 
 
 def _shows_the_same(scene: Observation, recorded: Observation) -> bool:

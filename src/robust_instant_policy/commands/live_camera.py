@@ -3,13 +3,12 @@
 recording process ── read, start image, lines ──▶ camera process ──▶ browser, http://127.0.0.1:…
                   ◀──── frames, errors ─────────  camera, keypoints
 
-So neither pictures nor keypoints take time of the process that commands the arms.
+Pictures and keypoints take no time of the process that commands the arms.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import multiprocessing
 import os
@@ -18,20 +17,19 @@ import signal
 import threading
 import time
 from collections.abc import Mapping
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from numpy.typing import NDArray
-from PIL import Image
-
 from robust_instant_policy.datasets import load_demonstrations
+from robust_instant_policy.datasets.images import encode_image
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import RipError, RobotError
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.network import is_loopback
+from robust_instant_policy.interrupts import blocked
+from robust_instant_policy.network import Answer, is_loopback, serve_loopback
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.reporting.pages import render
 from robust_instant_policy.reporting.pictures import Picture, keypoint_marks, picture
@@ -59,7 +57,7 @@ class LiveCamera:
         self.name, self.url = config.kind, ""
         context = multiprocessing.get_context("spawn")
         self._wire, self._theirs = context.Pipe()
-        self._outbox: SimpleQueue[tuple[str, object] | None] = SimpleQueue()  # nobody waits for the process to take it
+        self._outbox: SimpleQueue[tuple[str, object] | None] = SimpleQueue()  # `put` does not wait for the process
         self._sender = threading.Thread(target=self._send, daemon=True)
         device = (config.kind, dict(config.options), config.where)
         self._process = context.Process(
@@ -68,12 +66,9 @@ class LiveCamera:
 
     def connect(self) -> None:
         self._sender.start()
-        # Ctrl-C is the recording process's, also while the other one starts, which inherits what is blocked.
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-        try:
+        # Only the recording process handles Ctrl-C; the new process inherits the blocked signals.
+        with blocked(*SIGNALS):
             self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         self._theirs.close()  # so that the end of the process ends the pipe
         self.name, self.url = self._answer(STARTING_S)
 
@@ -136,10 +131,7 @@ def _serve(
     except RipError as error:
         wire.send(str(error))
         return
-    server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(page))
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    wire.send((camera.name, f"http://127.0.0.1:{server.server_address[1]}"))
+    wire.send((camera.name, serve_loopback(page.answer)))
     with contextlib.suppress(EOFError, OSError):
         _work(wire, camera, page)
     camera.disconnect()
@@ -164,9 +156,9 @@ def _work(wire: Connection, camera: VideoCamera, page: _Page) -> None:
             continue
         began = time.monotonic()
         try:
-            page.live = _jpeg(camera.preview())
+            page.live = encode_image(camera.preview(), "jpeg", quality=JPEG_QUALITY)
             page.error = ""
-        except Exception as error:  # of whatever library: the camera may be read all the same
+        except Exception as error:  # any error of a camera's library; `read` may still work
             page.error = str(error)
         now = time.monotonic()
         due = now + max(LIVE_S, (now - began) / MOST_SHARE)
@@ -207,41 +199,17 @@ class _Page:
         caption = "; ".join((f"{words} {low:.2f} to {high:.2f}", *located.notes))
         return picture(seen.rgb, caption, marks=keypoint_marks(located.pixels, located.confidence))
 
-
-def _handler(page: _Page) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            path, start = self.path.partition("?")[0], page.start
-            if not is_loopback(re.sub(r":\d+$", "", self.headers.get("Host", ""))):
-                self._send(403, "text/plain", b"this address is for this machine only")  # a name that resolves to it
-            elif path == "/":
-                self._send(200, "text/html", render("record.html", title="Recording").encode())
-            elif path == "/live.jpg":
-                self._send(200 if page.live else 404, "image/jpeg", page.live)
-            elif path == "/state":
-                state = {"line": page.line, "error": page.error, "start": page.shown}
-                self._send(200, "application/json", json.dumps(state).encode())
-            elif path == "/start":
-                self._send(200, "text/html", b"" if start is None else render("start.html", start=start).encode())
-            else:
-                self._send(404, "text/plain", b"not here")
-
-        def _send(self, status: int, kind: str, content: bytes) -> None:
-            with contextlib.suppress(OSError):  # the browser went away
-                self.send_response(status)
-                self.send_header("Content-Type", kind)
-                self.send_header("Content-Length", str(len(content)))
-                self.send_header("Cache-Control", "no-store")
-                self.end_headers()
-                self.wfile.write(content)
-
-        def log_message(self, format: str, *arguments: object) -> None:
-            """Write nothing to the terminal: the operator reads it."""
-
-    return Handler
-
-
-def _jpeg(rgb: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(rgb).save(buffer, format="jpeg", quality=JPEG_QUALITY)
-    return buffer.getvalue()
+    def answer(self, request: BaseHTTPRequestHandler) -> Answer:
+        path, start = request.path.partition("?")[0], self.start
+        if not is_loopback(re.sub(r":\d+$", "", request.headers.get("Host", ""))):
+            return 403, "text/plain", b"this address is for this machine only"  # a name that resolves to it
+        if path == "/":
+            return 200, "text/html", render("record.html", title="Recording").encode()
+        if path == "/live.jpg":
+            return 200 if self.live else 404, "image/jpeg", self.live
+        if path == "/state":
+            state = {"line": self.line, "error": self.error, "start": self.shown}
+            return 200, "application/json", json.dumps(state).encode()
+        if path == "/start":
+            return 200, "text/html", b"" if start is None else render("start.html", start=start).encode()
+        return 404, "text/plain", b"not here"

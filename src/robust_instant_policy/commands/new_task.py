@@ -1,8 +1,9 @@
-"""`rip new-task`: write the template of a task of one's own, or check one."""
+"""`rip new-task`: write the template of a user's task, or check a task."""
 
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 from importlib.resources import files
 from pathlib import Path
 
@@ -20,9 +21,7 @@ TEMPLATE_CLASS = "PlaceBlock"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, nargs="?", metavar="FILE", help="file to write, such as my_task.py")
     parser.add_argument("--check", metavar="TASK", help="task to check: module:Class, or any other name of a task")
-    parser.add_argument(
-        "--scenes", type=positive, default=NUM_SCENES, metavar="N", help="scenes to check it in (default: %(default)s)"
-    )
+    parser.add_argument("--scenes", type=positive, default=NUM_SCENES, metavar="N", help="scenes to check it in")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -48,12 +47,9 @@ def _write(path: Path) -> int:
 
 def _check(name: str, num_scenes: int) -> int:
     """Prints one line for each finding; 1 if one is an error."""
-    task = make_task(name)
-    try:
+    with closing(make_task(name)) as task:
         findings = check_task(task, num_scenes)
         lacking = [method for method in OPTIONAL_METHODS if not offers(task, method)]
-    finally:
-        task.close()
     for finding in findings:
         print(finding)
     for method in lacking:

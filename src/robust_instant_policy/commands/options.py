@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 from robust_instant_policy.policies.settings import CONFIGS, WORDS, Settings
@@ -33,12 +34,31 @@ def positive(text: str) -> int:
     return int(text)
 
 
+def share(least: float) -> Callable[[str], float]:
+    """The type of a number from ``least`` to 1."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = -1.0
+        if not least <= value <= 1:
+            raise argparse.ArgumentTypeError(f"must be a number from {least:g} to 1, not {text!r}")
+        return value
+
+    return parse
+
+
+def add_demos(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
+
+
 def add_assets(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--assets",
         choices=("code", "maniskill"),
         default="code",
-        help="objects built in code, or downloaded for ManiSkill (default: %(default)s)",
+        help="objects: built in code, or downloaded for it",
     )
 
 
@@ -48,7 +68,7 @@ def add_level(parser: argparse.ArgumentParser) -> None:
         choices=tuple(LEVELS),
         default=PAPER.name,
         help="difficulty of the scenes: as in the paper, or with camera noise, rotated objects, distractors, "
-        "other tables and light, hidden parts and start poses (default: %(default)s)",
+        "other tables and light, hidden parts and start poses",
     )
 
 
@@ -66,14 +86,21 @@ def add_rerun(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_llm(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--llm", default="embedded", help="language model: embedded, gguf:PATH, openai:MODEL or http://…#MODEL"
+    )
+
+
 def add_method(parser: argparse.ArgumentParser) -> None:
-    """Add the settings of the method; `method_settings` and `deadline` read them."""
+    """Add the language model and the settings of the method, which `planning.fitted_policy` reads."""
+    add_llm(parser)
+    parser.add_argument("--queries", type=positive, default=5, metavar="Q", help="samples per plan")
     parser.add_argument(
         "--config",
         choices=tuple(CONFIGS),
         default="adaptive",
-        help="paper, paper-real: as in the paper, with a column of its Table II; the settings below change parts of it "
-        "(default: %(default)s)",
+        help="paper, paper-real: as in the paper, with a column of its Table II; the settings below change parts of it",
     )
     add_keypoints(parser, "auto, or dino with --config paper", "registration, or nearest with --config paper")
     for name, words in (
@@ -84,11 +111,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
     ):
         parser.add_argument(f"--{name}", choices=WORDS[name], help=f"{words} (default: that of --config)")
     parser.add_argument(
-        "--deadline",
-        type=positive,
-        default=300,
-        metavar="SECONDS",
-        help="limit for the answers of one plan (default: %(default)s)",
+        "--deadline", type=positive, default=300, metavar="SECONDS", help="limit for the answers of one plan"
     )
 
 

@@ -6,23 +6,18 @@ import argparse
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import add_method, add_rerun, positive
+from robust_instant_policy.commands.options import add_demos, add_method, add_rerun
 from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.reporting.rerun_log import log_plan, open_recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--demos", required=True, metavar="DIR", help="folder of demonstrations")
+    add_demos(parser)
     parser.add_argument(
         "--observation", required=True, metavar="FILE", help=".npz with rgb, depth, intrinsics, camera_pose"
     )
-    parser.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
-    parser.add_argument("--queries", type=positive, default=5, metavar="Q", help="samples (default: %(default)s)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("plan.json"), metavar="FILE", help="the plan (default: %(default)s)"
-    )
+    parser.add_argument("--out", type=Path, default=Path("plan.json"), metavar="FILE", help="the plan")
     add_rerun(parser)
     add_method(parser)
 
@@ -35,6 +30,8 @@ def run(options: argparse.Namespace) -> int:
         plan = policy.plan(observation)
     plan.save(options.out)
     if options.rerun is not None:
+        from robust_instant_policy.reporting.rerun_log import log_plan, open_recording  # needs an extra
+
         with open_recording(options.rerun, "plan") as recording:
             log_plan(recording, observation, plan)
     for note in plan.notes:

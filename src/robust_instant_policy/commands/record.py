@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
@@ -17,10 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", required=True, help="name of the task; with --robot, any name")
     parser.add_argument("--robot", type=Path, metavar="FILE", help="file of a cell, to record with its leaders")
     parser.add_argument("--description", default="", help="with --robot: the task in words")
-    parser.add_argument("--episodes", type=positive, default=10, help="demonstrations (default: %(default)s)")
-    parser.add_argument(
-        "--seed", type=seed, default=0, help="seed of the first scene of a new folder (default: %(default)s)"
-    )
+    parser.add_argument("--episodes", type=positive, default=10, help="demonstrations")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the first scene of a new folder")
     parser.add_argument("--images", action="store_true", help="record an image for each step")
     parser.add_argument(
         "--every", type=positive, default=1, metavar="N", help="keep every N-th step: 5 reduces 55 Hz to 11 Hz"
@@ -36,17 +35,11 @@ def run(options: argparse.Namespace) -> int:
 
         return record_cell(options)
     screen = StageConsole()
-    task = make_task(options.task, assets=options.assets, level=options.level)
-    try:
+    with closing(make_task(options.task, assets=options.assets, level=options.level)) as task:
+        rate_hz, robot = task.record_hz / options.every, getattr(task, "robot_type", None)
         with (
             screen.stage(f"{options.episodes} demonstrations"),
-            DatasetWriter(
-                options.out,
-                task=task.name,
-                description=task.description,
-                rate_hz=task.record_hz / options.every,
-                robot_type=getattr(task, "robot_type", None),
-            ) as writer,
+            DatasetWriter(options.out, task.name, task.description, rate_hz, robot) as writer,
         ):
             thrown_away = record(
                 task,
@@ -57,8 +50,6 @@ def run(options: argparse.Namespace) -> int:
                 every=options.every,
                 on_progress=lambda there, count, _: screen.done_so_far("recording", there, count),
             )
-    finally:
-        task.close()
     screen.say(
         f"{options.out}: {options.episodes} demonstrations of {task.name}, {thrown_away} failed attempts discarded"
     )

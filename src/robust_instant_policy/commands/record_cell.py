@@ -13,6 +13,7 @@ from robust_instant_policy.commands.live_camera import LiveCamera
 from robust_instant_policy.datasets import DatasetWriter
 from robust_instant_policy.errors import CellError, UsageError
 from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.device import connected
 from robust_instant_policy.robots.emulation.client import Emulation, devices_of
 from robust_instant_policy.robots.leaders import make_leader
 from robust_instant_policy.robots.operator import Terminal
@@ -54,8 +55,7 @@ def record_cell(options: argparse.Namespace) -> int:
         with stop.ends_waiting():
             stack.enter_context(station)
             for leader in leaders:
-                leader.connect()
-                stack.callback(leader.disconnect)
+                stack.enter_context(connected(leader))
             stack.callback(camera.disconnect)
             camera.connect()
         screen.say(f"live picture and keypoints: {camera.url}")

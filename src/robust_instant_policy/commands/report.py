@@ -9,7 +9,6 @@ from robust_instant_policy.commands.options import add_rerun
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.evaluation import export_results, holds_results
 from robust_instant_policy.reporting.publication import PAGE_FILE, publish
-from robust_instant_policy.reporting.rerun_log import log_run, open_recording
 from robust_instant_policy.reporting.run import RunRecord, write_report
 
 
@@ -27,6 +26,8 @@ def run(options: argparse.Namespace) -> int:
         print(options.folder / PAGE_FILE)
         return 0
     if options.rerun is not None:
+        from robust_instant_policy.reporting.rerun_log import log_run, open_recording  # needs an extra
+
         record = RunRecord.load(options.folder)
         with open_recording(options.rerun, f"{record.task}: {record.outcome}") as recording:
             log_run(recording, options.folder)

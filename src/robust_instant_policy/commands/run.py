@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import RUNS, add_method, positive
+from robust_instant_policy.commands.options import RUNS, add_method, share
 from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import StoppedError, UsageError
 from robust_instant_policy.files import make_folder, write_whole
+from robust_instant_policy.llm import model_name
 from robust_instant_policy.motion.arm import Motion
 from robust_instant_policy.motion.guard import plan_guarded
-from robust_instant_policy.policies import RobustInstantPolicy
+from robust_instant_policy.policies import KeypointPolicy
 from robust_instant_policy.policies.policy import Plan
 from robust_instant_policy.reporting.run import (
     MEASURED_FILE,
@@ -32,6 +33,7 @@ from robust_instant_policy.reporting.run import (
 )
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.device import connected
 from robust_instant_policy.robots.emulation.client import Emulation, devices_of
 from robust_instant_policy.robots.execution import (
     has_open_grippers,
@@ -54,13 +56,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plan", type=Path, metavar="DIR", help="execute the plan of an earlier --dry-run in this folder"
     )
-    parser.add_argument("--llm", default="embedded", help="language model (default: %(default)s)")
-    parser.add_argument("--queries", type=positive, default=5, metavar="Q", help="samples (default: %(default)s)")
     parser.add_argument("--dry-run", action="store_true", help="everything but the motion: no arm is connected")
     parser.add_argument("--yes", action="store_true", help="execute without asking")
     parser.add_argument(
         "--speed",
-        type=_share,
+        type=share(0.05),
         metavar="SHARE",
         help="of the usual speed, 0.05 to 1 (default: 1, and first_run_speed until a run in this cell ended well)",
     )
@@ -81,7 +81,11 @@ def run(options: argparse.Namespace) -> int:
     make_folder(out)
     with ExitStack() as stack:
         config, emulation = stack.enter_context(devices_of(config))
-        planner = None if options.plan else stack.enter_context(_Planner.open(config, options, screen))
+        planner = None
+        if options.plan is None:
+            shown = load_demonstrations(options.demos)
+            policy = stack.enter_context(fitted_policy(options, shown, screen, config.limits.workspace))
+            planner = _Planner(config, screen, shown, policy, model_name(options.llm))
         _Run(config, emulation, planner, out, options, screen).run()
         for number in count(2):
             if options.plan or options.dry_run or options.yes or not _goes_on():
@@ -100,14 +104,8 @@ class _Planner:
     config: CellConfig
     screen: StageConsole
     demonstrations: Sequence[Demonstration]
-    policy: RobustInstantPolicy
-
-    @classmethod
-    @contextmanager
-    def open(cls, config: CellConfig, options: argparse.Namespace, screen: StageConsole) -> Iterator[_Planner]:
-        demonstrations = load_demonstrations(options.demos)
-        with fitted_policy(options, demonstrations, screen, config.limits.workspace) as policy:
-            yield cls(config, screen, demonstrations, policy)
+    policy: KeypointPolicy
+    llm: str
 
     def plan(self, seen: Observation, out: Path) -> RunRecord:
         """Plan for what is ``seen``; image, plan and context lie in the run folder ``out`` then."""
@@ -120,9 +118,7 @@ class _Planner:
         for note in plan.notes:
             self.screen.say(f"    {note}")
         task = self.demonstrations[0].task or self.config.name
-        return RunRecord(
-            task, task, None, self.policy.llm.name, self.policy.name, None, PLANNED, tuple(self.screen.stages)
-        )
+        return RunRecord(task, task, None, self.llm, self.policy.name, None, PLANNED, tuple(self.screen.stages))
 
 
 class _Run:
@@ -166,7 +162,7 @@ class _Run:
                 success = _agrees("did it succeed?")
                 self._report(record, success, ["success" if success else "failed: judged so", *grasps])
             played.require_end()
-        if success:  # not where nobody judged it
+        if success:  # None: not judged
             write_whole(self._done, b"")
 
     def _park(self, station: Station) -> None:
@@ -219,12 +215,8 @@ class _Run:
         if self._config.camera is None:
             raise UsageError(f"{self._config.path} has no table [camera]")
         camera = make_camera(self._config.camera, self._config.path.parent)
-        with self._screen.stage(f"image of camera {camera.name}"):
-            camera.connect()
-            try:
-                return observe(self._config, camera)
-            finally:
-                camera.disconnect()
+        with self._screen.stage(f"image of camera {camera.name}"), connected(camera):
+            return observe(self._config, camera)
 
     def _outcome(self, played: Played) -> tuple[bool | None, str]:
         """Whether the task is done, None where only a person can say, and the outcome in words."""
@@ -262,14 +254,3 @@ def _goes_on() -> bool:
         return _agrees("arrange the next scene; go on?")
     except StoppedError:  # the terminal was closed
         return False
-
-
-def _share(text: str) -> float:
-    """A share of the usual speed."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.05 <= value <= 1.0:
-        raise argparse.ArgumentTypeError(f"must be from 0.05 to 1, not {text!r}")
-    return value

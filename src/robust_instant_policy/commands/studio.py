@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
-from robust_instant_policy.commands.options import DATA
+from robust_instant_policy.commands.options import DATA, add_llm
 from robust_instant_policy.datasets.folder import read_recording
 from robust_instant_policy.datasets.layout import RIP_PATH
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import MissingExtraError, UsageError
+from robust_instant_policy.errors import UsageError, needs_extra
+from robust_instant_policy.interrupts import blocked
 from robust_instant_policy.llm import model_name
 from robust_instant_policy.tasks import require_task
 
@@ -27,13 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--observation", type=Path, metavar="FILE", help="a new scene (.npz) to plan for, instead of a simulator"
     )
-    parser.add_argument(
-        "--llm",
-        default="embedded",
-        help="language model: embedded, gguf:PATH, openai:MODEL or http://…#MODEL (default: %(default)s)",
-    )
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
-    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="0 for any (default: %(default)s)")
+    add_llm(parser)
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on")
+    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="0 for any")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -42,13 +37,8 @@ def run(options: argparse.Namespace) -> int:
         require_task(task)
     observation = Observation.load(options.observation) if options.observation else None
     model_name(options.llm)  # a spec that names no model is refused here, not at the first plan
-    with _undisturbed():
-        try:
-            from robust_instant_policy.studio.server import Choice, serve
-        except ModuleNotFoundError as error:
-            if error.name and error.name.startswith("robust_instant_policy"):
-                raise
-            raise MissingExtraError(error.name or "viser", "studio") from error
+    with blocked(signal.SIGINT), needs_extra("studio"):  # some libraries catch Ctrl-C while they are imported
+        from robust_instant_policy.studio.server import Choice, serve
     serve(Choice(task, options.demos, DATA / "studio", options.llm, observation), options.host, options.port)
     return 0
 
@@ -58,13 +48,3 @@ def _recorded_task(folder: Path) -> str:
     if not (folder / RIP_PATH).is_file():
         raise UsageError(f"{folder} is no folder of demonstrations; add --task NAME to record into it")
     return read_recording(folder)["task"]
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Ctrl-C waits until the end: some libraries catch it while they are imported, and it would be lost."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -5,20 +5,21 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from robust_instant_policy.commands.options import add_rerun, beside
+from robust_instant_policy.commands.options import add_demos, add_rerun, beside
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.reporting.demonstrations import write_page
-from robust_instant_policy.reporting.rerun_log import log_demonstrations, open_recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--demos", type=Path, required=True, metavar="DIR", help="folder of demonstrations")
+    add_demos(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="the page (default: DIR.html)")
     add_rerun(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     if options.rerun is not None:
+        from robust_instant_policy.reporting.rerun_log import log_demonstrations, open_recording  # needs an extra
+
         demonstrations = load_demonstrations(options.demos)
         with open_recording(options.rerun, demonstrations[0].task or "demonstrations") as recording:
             log_demonstrations(recording, demonstrations)

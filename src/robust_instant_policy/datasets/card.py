@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.tables import json_file
+from robust_instant_policy.datasets.statistics import Statistics
+from robust_instant_policy.datasets.tables import json_file, listed, parquet, task_table
 from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
 
+AllStatistics = Mapping[str, Statistics]  # by feature
 CARD = """\
 ---
 task_categories:
@@ -39,6 +41,14 @@ def dataset_card(info: Mapping[str, Any], task: str, description: str) -> bytes:
     """``README.md`` of a folder with the content ``info`` of ``meta/info.json``."""
     robot = info.get("robot_type") or "not named"
     return CARD.format_map({**info, "title": " ".join(description.split()), "task": task, "robot": robot}).encode()
+
+
+def write_summary(root: Path, info: Mapping[str, Any], task: str, description: str, statistics: AllStatistics) -> None:
+    """Write the files about a whole folder; ``meta/info.json`` last, as it counts the episodes."""
+    write_whole(root / layout.TASKS_PATH, parquet(task_table(description)))
+    write_whole(root / layout.CARD_PATH, dataset_card(info, task, description))
+    write_whole(root / layout.STATS_PATH, json_file({key: listed(value) for key, value in statistics.items()}))
+    write_whole(root / layout.INFO_PATH, json_file(info))
 
 
 def write_calibration(root: Path, episode: int, intrinsics: FloatArray, camera_pose: FloatArray) -> None:

@@ -1,4 +1,4 @@
-"""Depth in a colour image that survives lossy video, for recorders without depth streams (LeRobot 0.4).
+"""Depth coded in a colour image, robust to lossy video, for recorders without depth streams (LeRobot 0.4).
 
 The image is twice as high as the depth. Its upper half is grey, with coarse steps; black is no reading. The lower half
 holds fringes of the period P, as in three-step phase shifting of structured light:

@@ -1,7 +1,7 @@
 """Deleting, splitting, merging and restoring demonstrations. Folders are copied, images and videos bit by bit.
 
-`lerobot-edit-dataset` drops the start-of-episode images, cameras and facts that only this package knows; `restore`
-takes them from the folder that was edited.
+`lerobot-edit-dataset` drops this package's additions (start-of-episode images, cameras, facts); `restore` takes them
+from the original folder.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.card import dataset_card, write_calibration
+from robust_instant_policy.datasets.card import write_calibration, write_summary
 from robust_instant_policy.datasets.folder import (
-    REPAIR,
     STATISTICS_PREFIX,
     Folder,
     inside,
@@ -29,9 +28,10 @@ from robust_instant_policy.datasets.folder import (
     read_recording,
     read_table,
 )
+from robust_instant_policy.datasets.layout import REPAIR, damaged
 from robust_instant_policy.datasets.reader import square
 from robust_instant_policy.datasets.statistics import Statistics, extended, feature_statistics
-from robust_instant_policy.datasets.tables import json_file, listed, parquet, read_statistics, task_table
+from robust_instant_policy.datasets.tables import json_file, listed, parquet, read_statistics
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt, new_folder, read_regular, write_whole
 
@@ -121,7 +121,7 @@ def _write(
 
     The folders appear when all of them are complete, or not at all.
     """
-    outs = [Path(out).resolve() for _, out in parts]  # what is called "absent/../there" now would exist later
+    outs = [Path(out).resolve() for _, out in parts]  # resolved now: "absent/../there" would be another path later
     if any(one == other or one in other.parents for one, other in permutations(outs, 2)):
         raise DatasetError("the new folders must be different ones, none of them inside another")
     for root in {one.folder.root for episodes, _ in parts for one in episodes}:
@@ -147,7 +147,8 @@ def _fill(out: Path, episodes: Sequence[Recorded], keep: Collection[str] | None,
         statistics = _copy(one, out, place, frames, features, text)
         whole = extended(whole, statistics)
         frames += one.folder.episodes[one.episode]["length"]
-    seeds = [seed for recording in _recordings(episodes) for seed in recording.get("discarded_seeds", [])]
+    recordings = {one.folder.root: one.recording for one in episodes}.values()
+    seeds = [seed for recording in recordings for seed in recording.get("discarded_seeds", [])]
     own = {**first.recording, "description": text, "discarded_seeds": seeds}
     info = {
         **first.folder.info,
@@ -158,10 +159,7 @@ def _fill(out: Path, episodes: Sequence[Recorded], keep: Collection[str] | None,
         "features": features,
     }
     write_whole(out / layout.RIP_PATH, json_file(own))
-    write_whole(out / layout.TASKS_PATH, parquet(task_table(text)))
-    write_whole(out / layout.CARD_PATH, dataset_card(info, first.recording["task"], text))
-    write_whole(out / layout.STATS_PATH, json_file({key: listed(value) for key, value in whole.items()}))
-    write_whole(out / layout.INFO_PATH, json_file(info))
+    write_summary(out, info, first.recording["task"], text, whole)
     return len(episodes)
 
 
@@ -187,10 +185,6 @@ def _require_alike(first: Recorded, other: Recorded, description: str | None) ->
 
 def _shapes(folder: Folder) -> str:
     return str({key: (feature["dtype"], feature["shape"]) for key, feature in sorted(folder.info["features"].items())})
-
-
-def _recordings(episodes: Sequence[Recorded]) -> list[Mapping[str, Any]]:
-    return list({one.folder.root: one.recording for one in episodes}.values())
 
 
 def _copy(
@@ -233,7 +227,7 @@ def _row(
     description: str,
 ) -> pa.Table:
     """The row of meta/episodes as that of number ``place``, with the statistics ``counted`` of what counts."""
-    table = read_table(inside(one.folder.root, layout.episode_path(layout.EPISODES_PATTERN, one.episode)))
+    table = read_table(one.folder.own_file(layout.EPISODES_PATTERN, one.episode))
     table = table.filter(pc.equal(table["episode_index"], one.episode))
     table = table.drop_columns([name for name in table.column_names if _feature_of(name) not in (None, *features)])
     chunk, file = layout.chunk_and_file(place)
@@ -261,11 +255,11 @@ def _copy_files(one: Recorded, out: Path, place: int, features: Mapping[str, Any
     for key in (key for key, feature in features.items() if feature["dtype"] == "video"):
         if row.get(f"videos/{key}/from_timestamp") != 0:
             raise DatasetError(f"{root} keeps several episodes in one video, unlike rip; restore it from the original")
-        here = {"chunk_index": row[f"videos/{key}/chunk_index"], "file_index": row[f"videos/{key}/file_index"]}
+        here = {name: row[f"videos/{key}/{name}"] for name in layout.INDICES}
         content = _read(inside(root, layout.VIDEO_PATTERN.format(video_key=key, **here)))
         write_whole(out / layout.VIDEO_PATTERN.format(video_key=key, chunk_index=chunk, file_index=file), content)
     for pattern in (layout.START_RGB_PATTERN, layout.START_DEPTH_PATTERN):
-        content = _read(inside(root, layout.episode_path(pattern, one.episode)))
+        content = _read(one.folder.own_file(pattern, one.episode))
         write_whole(out / layout.episode_path(pattern, place), content)
 
 
@@ -274,9 +268,7 @@ def _copy_calibration(one: Recorded, out: Path, place: int) -> None:
     try:
         camera = square(row.get(layout.INTRINSICS_COLUMN), 3), square(row.get(layout.CAMERA_POSE_COLUMN), 4)
     except ValueError as error:
-        raise DatasetError(
-            f"{one.folder.root} is damaged: the camera of episode {one.episode}: {excerpt(error)}; {REPAIR}"
-        ) from None
+        raise damaged(one.folder.root, f"the camera of episode {one.episode}: {excerpt(error)}") from None
     write_calibration(out, place, *camera)
 
 

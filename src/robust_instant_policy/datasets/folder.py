@@ -1,7 +1,7 @@
 """The tables of any LeRobotDataset v3.0 folder; every problem is an error in one line.
 
-A folder may come from anywhere, so its content is checked once, when it is read: types and ranges in
-``meta/info.json`` and ``meta/episodes``, and that all their paths stay inside the folder.
+A folder may come from an unknown source, so its content is checked when it is read: types and ranges in
+``meta/info.json`` and ``meta/episodes``, and that all paths stay inside the folder.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
+from robust_instant_policy.datasets.layout import REPAIR, damaged
 from robust_instant_policy.datasets.video import decode_video
 from robust_instant_policy.demonstration import MAX_PIXELS
 from robust_instant_policy.errors import DatasetError, NoDemonstrationsError
@@ -37,7 +38,6 @@ STATISTICS_PREFIX = "stats/"  # columns of meta/episodes that are used for norma
 INFO_ENTRIES = ("codebase_version", "fps", "features", "total_episodes", "total_frames", "data_path")
 MAX_INDEX = 2**31  # of an episode, file, chunk or frame
 MAX_VALUES = 2**28  # numbers in the columns read from one file; v3.0 aims at files of 100 MB
-REPAIR = "restore it, or record the folder again"
 
 
 @dataclass(frozen=True)
@@ -64,15 +64,13 @@ class Folder:
     def columns(self, episode: int, names: Sequence[str]) -> pa.Table:
         """The frames of an episode, in order."""
         row = self.episodes[episode]
-        path = self._path("data_path", chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
+        path = self._path("data_path", **{name: row[f"data/{name}"] for name in layout.INDICES})
         table = _read_data(path, tuple(names), _stamp(path))
         table = table.filter(pc.equal(table["episode_index"], row["episode_index"])).sort_by("frame_index")
         if len(table) != row["length"]:
-            raise DatasetError(
-                f"{path} is damaged: episode {episode} has {len(table)} of its {row['length']} frames; {REPAIR}"
-            )
+            raise damaged(path, f"episode {episode} has {len(table)} of its {row['length']} frames")
         if not np.array_equal(table["frame_index"], np.arange(row["length"])):
-            raise DatasetError(f"{path} is damaged: frame_index of episode {episode} is not 0, 1, 2, …; {REPAIR}")
+            raise damaged(path, f"frame_index of episode {episode} is not 0, 1, 2, …")
         return table
 
     def matrix(self, episode: int, name: str) -> FloatArray:
@@ -81,28 +79,19 @@ class Folder:
         try:
             return _matrix(column)
         except (ValueError, pa.ArrowException) as error:
-            raise DatasetError(
-                f"{self.root} is damaged: episode {episode}: {name} {excerpt(error)}; {REPAIR}"
-            ) from None
+            raise damaged(self.root, f"episode {episode}: {name} {excerpt(error)}") from None
 
     def frames(self, episode: int, key: str, pixel_format: str = "rgb24") -> Iterator[NDArray]:
         """Images of an episode's video ``key``, in order: ``(H, W, 3)`` uint8, or of another ``pixel_format``."""
         row = self.episodes[episode]
         video = f"videos/{key}"
-        wanted = {f"{video}/{name}": low for name, low in (("chunk_index", 0), ("file_index", 0))}
-        _check_whole_numbers(self.root, episode, row, wanted)
+        _check_whole_numbers(self.root, episode, row, {f"{video}/{name}": 0 for name in layout.INDICES})
         start, stop = (row.get(f"{video}/{name}") for name in ("from_timestamp", "to_timestamp"))
         if not (isinstance(start, float | int) and isinstance(stop, float | int) and 0 <= start < stop < math.inf):
-            raise DatasetError(
-                f"{self.root} is damaged: episode {episode} of {excerpt(video)} lasts from {reprlib.repr(start)} "
-                f"to {reprlib.repr(stop)} s; {REPAIR}"
-            )
-        path = self._path(
-            "video_path",
-            video_key=key,
-            chunk_index=row[f"{video}/chunk_index"],
-            file_index=row[f"{video}/file_index"],
-        )
+            span = f"from {reprlib.repr(start)} to {reprlib.repr(stop)} s"
+            raise damaged(self.root, f"episode {episode} of {excerpt(video)} lasts {span}")
+        indices = {name: row[f"{video}/{name}"] for name in layout.INDICES}
+        path = self._path("video_path", video_key=key, **indices)
         count = 0
         for image in decode_video(path, start, stop, pixel_format):
             count += 1
@@ -111,7 +100,11 @@ class Folder:
             yield image
         if count != row["length"]:
             found = f"{count} of its" if count < row["length"] else "more images than its"
-            raise DatasetError(f"{path} is damaged: episode {episode} has {found} {row['length']} images; {REPAIR}")
+            raise damaged(path, f"episode {episode} has {found} {row['length']} images")
+
+    def own_file(self, pattern: str, episode: int) -> Path:
+        """Path of an episode's own file, see `layout`. Raises `DatasetError` if it is outside of the folder."""
+        return inside(self.root, layout.episode_path(pattern, episode))
 
     def _path(self, template: str, **fields: object) -> Path:
         if self.info.get(template) is None:
@@ -140,7 +133,7 @@ def open_folder(path: Path, task: str | None = None) -> Folder:
     info = read_json(file)
     missing = [entry for entry in INFO_ENTRIES if entry not in info]
     if missing:
-        raise DatasetError(f"{file} lacks {', '.join(missing)}; restore it, or record again")
+        raise DatasetError(f"{file} lacks {', '.join(missing)}; {REPAIR}")
     version = info["codebase_version"]
     if not (isinstance(version, str) and version.startswith("v3.")):
         own = path.resolve()
@@ -152,7 +145,7 @@ def open_folder(path: Path, task: str | None = None) -> Folder:
     try:
         _check_info(info)
     except ValueError as error:
-        raise DatasetError(f"{file} is damaged: {error}; {REPAIR}") from None
+        raise damaged(file, error) from None
     if info["total_episodes"] < 1:
         raise NoDemonstrationsError(f"{path} holds no demonstrations; {advice}")
     return Folder(path, info, _read_episodes(path, info["total_episodes"]))
@@ -164,9 +157,9 @@ def read_recording(root: Path) -> dict[str, Any]:
     own = read_json(file)
     seeds = own.get("discarded_seeds", [])
     if not isinstance(own.get("task"), str) or not isinstance(own.get("description", ""), str):
-        raise DatasetError(f"{file} is damaged: its task and description must be text; {REPAIR}")
+        raise damaged(file, "its task and description must be text")
     if not isinstance(seeds, list) or not all(seed is None or _is_whole(seed) for seed in seeds):
-        raise DatasetError(f"{file} is damaged: its discarded_seeds must be a list of whole numbers; {REPAIR}")
+        raise damaged(file, "its discarded_seeds must be a list of whole numbers")
     return own
 
 
@@ -235,7 +228,7 @@ def _read_data(path: Path, names: tuple[str, ...], stamp: tuple[int, ...]) -> pa
     table = read_table(path, ["episode_index", "frame_index", *names])
     for name in ("episode_index", "frame_index"):
         if not pa.types.is_integer(table[name].type):
-            raise DatasetError(f"{path} is damaged: {name} is {table[name].type}, not whole numbers; {REPAIR}")
+            raise damaged(path, f"{name} is {table[name].type}, not whole numbers")
     return table
 
 
@@ -301,16 +294,11 @@ def _read_episodes(root: Path, count: int) -> list[dict[str, Any]]:
         try:
             rows += table.to_pylist()
         except (ValueError, OverflowError, pa.ArrowException) as error:
-            raise DatasetError(f"{path} is damaged ({excerpt(error)}); {REPAIR}") from None
+            raise damaged(path, excerpt(error)) from None
         if len(rows) > count + 1:
-            raise DatasetError(
-                f"{root} is damaged: {layout.INFO_PATH} counts {count} episodes, meta/episodes lists more; {REPAIR}"
-            )
+            raise damaged(root, f"{layout.INFO_PATH} counts {count} episodes, meta/episodes lists more")
     if len(rows) < count or [row.get("episode_index") for row in rows[:count]] != list(range(count)):
-        raise DatasetError(
-            f"{root} is damaged: meta/episodes lists {len(rows)} of {count} episodes, or out of order; "
-            "restore it, or record again"
-        )
+        raise damaged(root, f"meta/episodes lists {len(rows)} of {count} episodes, or out of order")
     for episode, row in enumerate(rows[:count]):
         _check_whole_numbers(root, episode, row, {"length": 1, "data/chunk_index": 0, "data/file_index": 0})
     return rows[:count]
@@ -320,7 +308,5 @@ def _check_whole_numbers(root: Path, episode: int, row: Mapping[str, Any], least
     """Raises `DatasetError` unless the entries of a row are whole numbers, each at least as large as given."""
     for name, low in least.items():
         if not _is_whole(row.get(name), low):
-            raise DatasetError(
-                f"{root} is damaged: {name} of episode {episode} is {reprlib.repr(row.get(name))}, not a whole number; "
-                "restore it, or record again"
-            )
+            found = reprlib.repr(row.get(name))
+            raise damaged(root, f"{name} of episode {episode} is {found}, not a whole number")

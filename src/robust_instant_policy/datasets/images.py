@@ -6,18 +6,19 @@ import io
 import struct
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from robust_instant_policy.datasets.layout import REPAIR
 from robust_instant_policy.demonstration import MAX_PIXELS
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import open_regular
 
 FINE_UNIT_M = 1e-4  # one step of 16-bit depth; reaches 6.5 m
 COARSE_UNIT_M = 1e-3  # for cameras that read further; reaches 65.5 m
-REPAIR = "restore it, or record the folder again"
 MAX_STEPS = np.iinfo(np.uint16).max
 
 
@@ -25,10 +26,11 @@ MAX_STEPS = np.iinfo(np.uint16).max
 DAMAGE = (OSError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError, Image.DecompressionBombWarning)
 
 
-def encode_png(image: NDArray) -> bytes:
-    """PNG of an RGB image ``(H, W, 3)`` uint8 or a grey one ``(H, W)`` uint16."""
+def encode_image(image: NDArray | Image.Image, form: str = "png", **options: Any) -> bytes:
+    """A file of an RGB image ``(H, W, 3)`` uint8, or of a grey one ``(H, W)`` uint16, with Pillow's ``options``."""
     buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(image)).save(buffer, format="png")
+    picture = image if isinstance(image, Image.Image) else Image.fromarray(np.ascontiguousarray(image))
+    picture.save(buffer, format=form, **options)
     return buffer.getvalue()
 
 
@@ -49,7 +51,7 @@ def encode_depth(depth: NDArray[np.float32]) -> tuple[bytes, float]:
         )
     steps = np.zeros(metres.shape, dtype=np.uint16)
     steps[valid] = np.clip(np.rint(metres[valid] / unit), 1, MAX_STEPS).astype(np.uint16)
-    return encode_png(steps), unit
+    return encode_image(steps), unit
 
 
 def millimetres(depth: NDArray) -> NDArray[np.uint16]:

@@ -12,8 +12,10 @@ import string
 from collections.abc import Collection
 from pathlib import Path
 
+from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.trajectory import ACTION_DIM
 
+REPAIR = "restore it, or record the folder again"
 CODEBASE_VERSION = "v3.0"
 RIP_FORMAT = 1  # version of the additions: rip.json, the start/ folder and the rip/ columns
 
@@ -46,6 +48,11 @@ INFO_COLUMN = "rip/info"
 
 PLAIN_NUMBER = re.compile(r"0?[1-9]?d?")  # format of an index in a path template; the format's own is 03d
 INDICES = ("chunk_index", "file_index")
+
+
+def damaged(where: object, what: object) -> DatasetError:
+    """The error for a file or folder whose content is not as it was written."""
+    return DatasetError(f"{where} is damaged: {what}; {REPAIR}")
 
 
 def check_template(template: str, fields: Collection[str]) -> None:

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.folder import Folder, inside, open_folder, read_recording, read_seed
+from robust_instant_policy.datasets.folder import Folder, open_folder, read_recording, read_seed
 from robust_instant_policy.datasets.images import read_depth, read_rgb
+from robust_instant_policy.datasets.layout import damaged
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.files import excerpt, parse_json
@@ -69,14 +70,13 @@ def load_frames(path: str | Path, episode: int) -> Iterator[NDArray[np.uint8]]:
 def _read_demonstration(folder: Folder, episode: int, task: str) -> Demonstration:
     row = folder.episodes[episode]
     actions = folder.matrix(episode, layout.ACTION_KEY)
-    rgb_path, depth_path = (
-        inside(folder.root, layout.episode_path(pattern, episode))
-        for pattern in (layout.START_RGB_PATTERN, layout.START_DEPTH_PATTERN)
-    )
     try:
+        unit = row[layout.DEPTH_UNIT_COLUMN]
+        if not (isinstance(unit, float) and 0 < unit < np.inf):
+            raise ValueError(f"{layout.DEPTH_UNIT_COLUMN} must be a positive number, got {unit!r}")
         observation = Observation(
-            rgb=read_rgb(rgb_path),
-            depth=read_depth(depth_path, _depth_unit(row[layout.DEPTH_UNIT_COLUMN])),
+            rgb=read_rgb(folder.own_file(layout.START_RGB_PATTERN, episode)),
+            depth=read_depth(folder.own_file(layout.START_DEPTH_PATTERN, episode), unit),
             intrinsics=square(row[layout.INTRINSICS_COLUMN], 3),
             camera_pose=square(row[layout.CAMERA_POSE_COLUMN], 4),
         )
@@ -90,19 +90,9 @@ def _read_demonstration(folder: Folder, episode: int, task: str) -> Demonstratio
             partial(folder.frames, episode, layout.VIDEO_KEY) if layout.VIDEO_KEY in folder.video_keys else None,
         )
     except KeyError as error:
-        raise DatasetError(
-            f"{folder.root} is damaged: meta/episodes lacks {excerpt(error)}; restore it, or record again"
-        ) from None
+        raise damaged(folder.root, f"meta/episodes lacks {excerpt(error)}") from None
     except (InvalidValueError, ValueError) as error:
-        raise DatasetError(
-            f"{folder.root} is damaged: episode {episode}: {excerpt(error)}; restore it, or record again"
-        ) from error
-
-
-def _depth_unit(value: object) -> float:
-    if not (isinstance(value, float) and 0 < value < np.inf):
-        raise ValueError(f"{layout.DEPTH_UNIT_COLUMN} must be a positive number, got {value!r}")
-    return value
+        raise damaged(folder.root, f"episode {episode}: {excerpt(error)}") from error
 
 
 def square(values: object, side: int) -> FloatArray:

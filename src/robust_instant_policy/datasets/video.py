@@ -6,12 +6,12 @@ import io
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 
+from robust_instant_policy.datasets.layout import REPAIR
 from robust_instant_policy.demonstration import MAX_PIXELS
 from robust_instant_policy.errors import DatasetError, InvalidValueError
 from robust_instant_policy.files import open_regular, write_whole
@@ -31,11 +31,6 @@ FILM_OPTIONS = {"preset": "veryfast", "crf": "26"}  # for videos in pages: a ten
 MAX_RATE_DENOMINATOR = 1001  # as in 30000/1001 Hz
 
 
-def rate_fraction(rate_hz: float) -> Fraction:
-    """The rate as a ratio, for the clock of a video."""
-    return Fraction(rate_hz).limit_denominator(MAX_RATE_DENOMINATOR)
-
-
 class VideoEncoder:
     """Encodes images ``(H, W, 3)`` uint8, H and W even, one by one as MP4.
 
@@ -44,7 +39,7 @@ class VideoEncoder:
     """
 
     def __init__(self, rate_hz: float, options: Mapping[str, str] = X264_OPTIONS):
-        self._rate = rate_fraction(rate_hz)
+        self._rate = Fraction(rate_hz).limit_denominator(MAX_RATE_DENOMINATOR)  # for the clock of the video
         self._buffer = io.BytesIO()
         self._container = av.open(self._buffer, "w", format="mp4")
         self._stream = self._container.add_stream(CODEC, rate=self._rate)
@@ -80,7 +75,9 @@ class VideoEncoder:
 
 
 class VideoWriter:
-    """Writes a video to ``path`` atomically when closed; without images, an existing file is removed.
+    """Writes a video to ``path`` at the end of the ``with`` block; without images, an existing file is removed.
+
+    Raises `DatasetError` where it cannot be written.
 
     >>> with VideoWriter("run.mp4", fps=20) as video:
     ...     task.execute(trajectory, on_frame=video.add)
@@ -94,13 +91,7 @@ class VideoWriter:
     def __enter__(self) -> VideoWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Write the file. Raises `DatasetError` if that is not possible."""
+    def __exit__(self, *_: object) -> None:
         content = self._encoder.finish()
         if content:
             write_whole(self._path, content)
@@ -135,12 +126,12 @@ def decode_video(
                 if frame.time >= stop_s - half_frame:
                     return
                 if (frame.width, frame.height) != (stream.width, stream.height):
-                    raise DatasetError(f"{path} holds images of several sizes: restore it, or record the folder again")
+                    raise DatasetError(f"{path} holds images of several sizes: {REPAIR}")
                 if frame.time >= start_s - half_frame:
                     yield frame.to_ndarray(format=pixel_format)
-    # Of what a damaged file lacks, PyAV gives None, or an attribute that is not there.
+    # For data that a damaged file lacks, PyAV returns None or has no such attribute.
     except (
         OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError, MemoryError,
         RuntimeError, av.FFmpegError,
     ) as error:  # fmt: skip
-        raise DatasetError(f"{path} cannot be read as a video: restore it, or record the folder again") from error
+        raise DatasetError(f"{path} cannot be read as a video: {REPAIR}") from error

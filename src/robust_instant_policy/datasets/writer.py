@@ -9,38 +9,28 @@ import reprlib
 from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.card import dataset_card, write_calibration
+from robust_instant_policy.datasets.card import write_calibration, write_summary
 from robust_instant_policy.datasets.folder import Folder, inside, open_folder, read_recording, read_seed
-from robust_instant_policy.datasets.images import encode_depth, encode_png
+from robust_instant_policy.datasets.images import encode_depth, encode_image
 from robust_instant_policy.datasets.statistics import Statistics, extended, feature_statistics, image_statistics
 from robust_instant_policy.datasets.tables import (
     episode_table,
     features_of,
     frame_table,
     json_file,
-    listed,
     parquet,
     read_statistics,
-    task_table,
 )
 from robust_instant_policy.datasets.video import encode_video
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import (
-    PART_SUFFIX,
-    excerpt,
-    finished_files,
-    lock_folder,
-    make_folder,
-    write_whole,
-)
+from robust_instant_policy.files import PART_SUFFIX, excerpt, finished_files, lock_folder, make_folder, write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
@@ -80,9 +70,7 @@ class DatasetWriter:
     def __enter__(self) -> DatasetWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -152,9 +140,9 @@ class DatasetWriter:
             self._discarded_seeds = own.get("discarded_seeds", [])
             self._take_up()
             return
-        stranger = next(finished_files(self.path), None)
-        if stranger is not None:
-            raise DatasetError(f"{self.path} holds other files ({stranger.name}); choose an empty or a new folder")
+        other = next(finished_files(self.path), None)
+        if other is not None:
+            raise DatasetError(f"{self.path} holds other files ({other.name}); choose an empty or a new folder")
         self._take_up()
         self._write_own([])
 
@@ -296,7 +284,7 @@ class DatasetWriter:
         """Write the start-of-episode images; returns the columns for the other data of the start."""
         observation = demonstration.observation
         depth, unit = encode_depth(observation.depth)
-        self._write_file(layout.START_RGB_PATTERN, episode, encode_png(observation.rgb))
+        self._write_file(layout.START_RGB_PATTERN, episode, encode_image(observation.rgb))
         self._write_file(layout.START_DEPTH_PATTERN, episode, depth)
         return {
             layout.INTRINSICS_COLUMN: observation.intrinsics.ravel().tolist(),
@@ -325,11 +313,7 @@ class DatasetWriter:
             "video_path": layout.VIDEO_PATTERN if layout.VIDEO_KEY in features else None,
             "features": features,
         }
-        if num_episodes == 1:
-            write_whole(self.path / layout.TASKS_PATH, parquet(task_table(self.description)))
-        write_whole(self.path / layout.CARD_PATH, dataset_card(info, self.task, self.description))
-        write_whole(self.path / layout.STATS_PATH, json_file({key: listed(value) for key, value in statistics.items()}))
-        write_whole(self.path / layout.INFO_PATH, json_file(info))
+        write_summary(self.path, info, self.task, self.description, statistics)
         return info
 
     def _write_file(self, pattern: str, episode: int, content: bytes) -> None:

@@ -1,7 +1,8 @@
 """Workers on a Ray cluster: any number of machines, any of which may fail.
 
 No shared disk is needed. Each worker gets the demonstrations once. One actor, on the machine where the command runs,
-reads and writes the samples. Outcomes are streamed back one by one.
+reads and writes the samples. Outcomes are streamed back one by one. Importing this module raises `MissingExtraError`
+without the extra `distributed`.
 """
 
 from __future__ import annotations
@@ -14,12 +15,17 @@ from typing import Any, cast
 
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
-from robust_instant_policy.errors import MissingExtraError, UsageError
+from robust_instant_policy.errors import UsageError, needs_extra
 from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.work import Outcome, SceneWork, Setup
 from robust_instant_policy.evaluation.workbench import Workbench
 from robust_instant_policy.evaluation.workers import ONE_THREAD, Died, Finished, Message, Worker, WorkError, run_pool
 from robust_instant_policy.llm import SampleStore
+
+with needs_extra("distributed"):
+    import ray
+    from ray.exceptions import RayActorError
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 CORES_A_WORKER = 1
 POLL_SECONDS = 2.0  # between two checks for free cores
@@ -35,12 +41,8 @@ class RayWorkers:
     def __call__(self, setup: Setup, works: list[SceneWork]) -> Iterator[Outcome]:
         """Do ``works``; the loss of a machine counts as the death of its workers.
 
-        Raises `MissingExtraError` without Ray, and `UsageError` if there is no cluster at the address.
+        Raises `UsageError` if there is no cluster at the address.
         """
-        try:
-            import ray
-        except ModuleNotFoundError as error:
-            raise MissingExtraError("ray", "distributed") from error
         own = {"include_dashboard": False} if self.address == "local" else {}
         try:
             ray.init(address=self.address, log_to_driver=False, logging_level="warning", **own)
@@ -66,9 +68,6 @@ class _Actors:
     """A `Pool` of actors: as many as the cluster has room for, up to ``most``."""
 
     def __init__(self, setup: Setup, demonstrations: dict[str, list[Demonstration]], most: int | None):
-        import ray
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
         self._setup, self._most = setup, most
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
         store = ray.remote(num_cpus=0, scheduling_strategy=here)(SampleStore)
@@ -80,8 +79,6 @@ class _Actors:
         self._members: list[_Member] = []
 
     def workers(self, wanted: int) -> list[_Member]:
-        import ray
-
         if self._most is not None:
             wanted = min(wanted, self._most)
         room = int(ray.available_resources().get("CPU", 0) // CORES_A_WORKER)
@@ -93,9 +90,6 @@ class _Actors:
         worker.stream = worker.actor.run.options(num_returns="streaming").remote(work)
 
     def receive(self, busy: Collection[_Member]) -> Iterator[tuple[_Member, Message]]:
-        import ray
-        from ray.exceptions import RayActorError
-
         by_stream = {worker.stream: worker for worker in busy}
         if not by_stream:  # no machine has a free core
             time.sleep(POLL_SECONDS)
@@ -114,15 +108,15 @@ class _Actors:
                 yield worker, message
 
     def close(self) -> None:
-        """Does nothing: Ray ends the actors when the driver disconnects."""
+        """Ray ends the actors when the driver disconnects."""
 
 
 class _Actor:
     """A worker: a workbench in a Ray actor."""
 
     def __init__(self, setup: Setup, store: Any, shown: dict[str, Any]):
-        self._shown = shown
-        self._bench = Workbench(setup, cast(SampleStore, _DistantStore(store, setup.store)), self._demonstrations)
+        samples = cast(SampleStore, _DistantStore(store, setup.store))
+        self._bench = Workbench(setup, samples, lambda task, count: ray.get(shown[task])[:count])
 
     def run(self, work: SceneWork) -> Iterator[Outcome | WorkError]:
         """Yields each outcome of ``work``, and the error that ended it early, if any."""
@@ -130,11 +124,6 @@ class _Actor:
             yield from self._bench.run(work)
         except Exception as error:
             yield WorkError.of(error)
-
-    def _demonstrations(self, task: str, count: int) -> list[Demonstration]:
-        import ray
-
-        return ray.get(self._shown[task])[:count]
 
 
 class _DistantStore:
@@ -144,8 +133,6 @@ class _DistantStore:
         self._actor, self.path = actor, path
 
     def __getattr__(self, name: str) -> Any:
-        import ray
-
         return lambda *arguments: ray.get(getattr(self._actor, name).remote(*arguments))
 
 

@@ -1,4 +1,4 @@
-"""Run suites of variants in scenes with a pool of workers; each row is stored at once, so a run can be resumed."""
+"""Run suites of variants in scenes with a pool of workers; rows are stored one by one, so a run can be resumed."""
 
 from __future__ import annotations
 
@@ -16,11 +16,7 @@ from robust_instant_policy.evaluation.episodes import Episode, Trial
 from robust_instant_policy.evaluation.failures import Failure, video_file
 from robust_instant_policy.evaluation.manifest import code_digest
 from robust_instant_policy.evaluation.recording import Recording, record_all
-from robust_instant_policy.evaluation.scenes import (
-    demonstration_digests,
-    demonstrations_folder,
-    stored_demonstrations,
-)
+from robust_instant_policy.evaluation.scenes import demonstration_digests, demonstrations_folder, stored_demonstrations
 from robust_instant_policy.evaluation.store import ResultsStore
 from robust_instant_policy.evaluation.suites import Suite
 from robust_instant_policy.evaluation.variant import Scene, Variant

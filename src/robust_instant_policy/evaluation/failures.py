@@ -1,16 +1,15 @@
 """Failure analysis: which stage a failed episode failed in, found by replacing stages with the truth one by one.
 
-Execution, keypoints, regression and samples are checked in this order, and the failure is counted for the first that
-it is due to:
+The stages are checked in this order, and a failure counts for the first one that explains it:
 
 - *execution*: the demonstrator's own trajectory for the scene, downsampled and executed like a plan, fails too;
 - *keypoints*: with the true keypoints in place of those that perception found, the same method succeeds;
 - *regression*: one of the candidates that were aggregated succeeds by itself;
 - *samples*: none of them does, or the trajectory that failed is a single sample, not aggregated.
 
-A closed-loop policy has no such stages; beyond the execution, its failures are its own (*policy*). A task of one's own
-may have no demonstrator or no ground truth: a check that needs them is left out, and a failure that only the ground
-truth could attribute is *unknown*.
+For a closed-loop policy only the execution is checked; other failures count as *policy*. A user's task may have no
+demonstrator or no ground truth: checks that need them are left out, and a failure that only the ground truth could
+attribute is *unknown*.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from pathlib import Path
 from robust_instant_policy.errors import DatasetError, UsageError
 from robust_instant_policy.evaluation.experiment import PLAN_FOLDER, TRAINING_FOLDER, one_writer
 from robust_instant_policy.evaluation.failures import video_file
-from robust_instant_policy.evaluation.store import Results, ResultsStore, read_results
+from robust_instant_policy.evaluation.store import ResultsStore, read_results
 from robust_instant_policy.evaluation.work import STORE_FILE
 from robust_instant_policy.files import finished_files, make_folder, read_regular, write_whole
 from robust_instant_policy.llm import SampleStore
@@ -35,7 +35,10 @@ def merge(folders: Sequence[Path], out: Path) -> list[Share]:
     """
     if out.resolve() in [folder.resolve() for folder in folders]:
         raise UsageError(f"{out} is itself one of the runs; leave it out of them, or give a new folder")
-    runs = [(folder, _read(folder)) for folder in folders]
+    runs = [(folder, read_results(folder)) for folder in folders]
+    for folder, run in runs:
+        if not run.episodes:
+            raise DatasetError(f"{folder} holds no executions; give folders that rip eval --out wrote")
     make_folder(out)
     shares = []
     with one_writer(out), closing(ResultsStore(out)) as store:
@@ -43,7 +46,8 @@ def merge(folders: Sequence[Path], out: Path) -> list[Share]:
             known = {row.key: row for row in store.results().episodes}
             # a row of out wins, with its video and failure analysis
             own = {row.key for row in run.episodes if known.get(row.key, row) == row}
-            for name in (*_pictures(folder), *(video_file(*key) for key in own)):
+            pictures = (file for name in (PLAN_FOLDER, TRAINING_FOLDER) for file in finished_files(folder / name))
+            for name in (*(str(file.relative_to(folder)) for file in pictures), *(video_file(*key) for key in own)):
                 if (folder / name).exists() and not (out / name).exists():
                     write_whole(out / name, read_regular(folder / name))
             if (folder / STORE_FILE).exists():
@@ -56,17 +60,3 @@ def merge(folders: Sequence[Path], out: Path) -> list[Share]:
             shares.append(Share(folder, new, len(run.episodes) - new))
         store.export()
     return shares
-
-
-def _read(folder: Path) -> Results:
-    results = read_results(folder)
-    if not results.episodes:
-        raise DatasetError(f"{folder} holds no executions; give folders that rip eval --out wrote")
-    return results
-
-
-def _pictures(folder: Path) -> Iterator[str]:
-    """Files of plans and trainings, from the folder on."""
-    for name in (PLAN_FOLDER, TRAINING_FOLDER):
-        for path in sorted(finished_files(folder / name)):
-            yield str(path.relative_to(folder))

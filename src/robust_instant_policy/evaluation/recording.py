@@ -6,7 +6,9 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from robust_instant_policy.evaluation.processes import end_with_parent, one_thread_each
@@ -30,15 +32,9 @@ class Recording:
 
     def make(self, report: Report) -> None:
         """Record what the folder lacks."""
-        task = make_task(self.scene.task, assets=self.scene.assets, level=self.scene.level)
-
-        def progress(there: int, count: int, discarded: int) -> None:
-            report(self.scene.task, there, count, discarded)
-
-        try:
+        with closing(make_task(self.scene.task, assets=self.scene.assets, level=self.scene.level)) as task:
+            progress = partial(report, self.scene.task)
             obtain_demonstrations(task, self.folder, self.count, progress, self.with_images, self.demo_set)
-        finally:
-            task.close()
 
 
 def record_all(recordings: Sequence[Recording], processes: int, report: Report) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Observation
@@ -13,7 +13,7 @@ from robust_instant_policy.errors import RipError, UnreachableError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.policies import ClosedLoopPolicy, LocatedScene, Plan
+from robust_instant_policy.policies import ClosedLoopPolicy, KeypointPolicy, LocatedScene, Plan
 from robust_instant_policy.policies.policy import UNPLANNABLE
 from robust_instant_policy.tasks.task import Execution, FrameSink, Task, require
 from robust_instant_policy.trajectory import Trajectory
@@ -24,14 +24,15 @@ def reason(error: Exception) -> str:
     return str(error) if isinstance(error, RipError) else f"unexpected {type(error).__name__}: {error}"
 
 
-class ScenePolicy(Protocol):
-    """A fitted policy that plans from an image, or from given keypoints."""
+@dataclass(frozen=True)
+class ScenePolicy:
+    """Plans for the current scene, from its image or from given keypoints; ``executions`` are a plan's trajectories to
+    execute. ``fitted`` is the policy that plans, None for another source of plans."""
 
-    def plan(self, observation: Observation) -> Plan: ...
-
-    def plan_scene(self, scene: LocatedScene) -> Plan: ...
-
-    def executions(self, plan: Plan) -> tuple[Trajectory, ...]: ...
+    plan: Callable[[Observation], Plan]
+    plan_scene: Callable[[LocatedScene], Plan]
+    executions: Callable[[Plan], tuple[Trajectory, ...]] = lambda plan: (plan.trajectory,)
+    fitted: KeypointPolicy | None = None
 
 
 def roll_out(

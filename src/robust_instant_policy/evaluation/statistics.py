@@ -17,7 +17,7 @@ from scipy import stats
 from robust_instant_policy.errors import InvalidValueError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.suites import Suite
-from robust_instant_policy.evaluation.variant import ROW_METHODS, Scene, Variant
+from robust_instant_policy.evaluation.variant import ROW_METHODS, Scene, Variant, labels
 from robust_instant_policy.geometry import FloatArray
 
 MARKS = ((5e-3, "**"), (5e-2, "*"))  # the paper's, below these p-values
@@ -25,27 +25,19 @@ CONFIDENCE = 0.95
 RESAMPLES = 10_000  # of the bootstrap
 
 
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95% confidence interval of a success rate (Wilson 1927); (0, 1) without trials."""
+def wilson_interval(successes: float, trials: int) -> tuple[float, float]:
+    """95% confidence interval of a success rate (Wilson 1927); (0, 1) without trials.
+
+    A trial is a scene, and ``successes`` the sum of the success rates in the scenes. The rate of a scene with several
+    executions varies at most as much as a single execution with that probability, so the interval is not too narrow.
+    """
     if not 0 <= successes <= trials:
         raise InvalidValueError(f"successes must lie between 0 and trials, got {successes} of {trials}")
     if trials == 0:
         return 0.0, 1.0
-    interval = stats.binomtest(successes, trials).proportion_ci(method="wilson")
-    return float(interval.low), float(interval.high)
-
-
-def scene_interval(mean: float, scenes: int) -> tuple[float, float]:
-    """95% confidence interval of the ``mean`` of the success rates in so many ``scenes``; (0, 1) without scenes.
-
-    Wilson's interval (Wilson 1927) with one trial a scene. A scene's rate, of whatever number of executions, varies at
-    most as much as a single execution with that probability, so the interval is not too narrow.
-    """
-    if scenes == 0:
-        return 0.0, 1.0
-    z = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
-    middle = (mean + z**2 / (2 * scenes)) / (1 + z**2 / scenes)
-    half = z / (1 + z**2 / scenes) * math.sqrt(mean * (1 - mean) / scenes + z**2 / (4 * scenes**2))
+    z, mean = float(stats.norm.ppf((1 + CONFIDENCE) / 2)), successes / trials
+    middle = (mean + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z / (1 + z**2 / trials) * math.sqrt(mean * (1 - mean) / trials + z**2 / (4 * trials**2))
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
@@ -67,9 +59,8 @@ def mean_and_deviation(rates: Sequence[float]) -> tuple[float, float]:
 def t_test(ours: Sequence[float], theirs: Sequence[float]) -> float:
     """Two-sided p of Student's t-test between two methods' success rates over the same tasks; NaN for fewer than two.
 
-    It is computed from mean and standard deviation as `mean_and_deviation` gives them: with these the paper's marks
-    come out of the paper's own Table I, all four. It compares tasks, not executions, and takes no notice of which
-    scenes the methods share: see `paired_test`.
+    Computed from `mean_and_deviation`: this reproduces all four significance marks of the paper from its own Table I.
+    The unit is the task; shared scenes are not used (see `paired_test`).
     """
     if min(len(ours), len(theirs)) < 2:
         return math.nan
@@ -99,9 +90,9 @@ class Paired:
 def paired_test(ours: Mapping[Scene, Fraction], theirs: Mapping[Scene, Fraction]) -> Paired:
     """Exact sign-flip test of the success rates in the scenes that two methods share.
 
-    Were the methods alike, every scene's difference might as well have the other sign: p is the share of all choices of
-    signs with a total at least as far from 0. With one execution a scene this is McNemar's exact test. The scene is the
-    unit, however many executions its rate is of.
+    If the methods are equal, each scene's difference has either sign with equal probability: p is the share of all
+    sign choices whose total is at least as far from 0. The unit is the scene. With one execution a scene this is
+    McNemar's exact test.
     """
     shared = [scene for scene in ours if scene in theirs]
     differences = [ours[scene] - theirs[scene] for scene in shared]
@@ -141,7 +132,7 @@ def difference_interval(ours: Mapping[Scene, Fraction], theirs: Mapping[Scene, F
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Corrected for the number of comparisons (Holm 1979), in the same order; NaN stays, and counts as none."""
+    """p-values corrected by Holm's method (Holm 1979), in the same order; NaN is no comparison and stays NaN."""
     corrected = [math.nan] * len(p_values)
     known = sorted((p, index) for index, p in enumerate(p_values) if not math.isnan(p))
     largest = 0.0
@@ -168,8 +159,8 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95%, see `scene_interval`."""
-        return scene_interval(self.value, self.scenes)
+        """95%, see `wilson_interval`."""
+        return wilson_interval(float(sum(self.of_scenes)), self.scenes)
 
 
 @dataclass(frozen=True)
@@ -195,8 +186,8 @@ class Comparison:
 class Summary:
     """The success of the variants of ``suite``, counted from those of ``episodes`` that belong to it.
 
-    Variants that differ in nothing but the set of demonstrations are one, whose rates are averages over the sets. Where
-    a variant was shown different demonstrations of one task and set, those shown last count.
+    Variants that differ only in the set of demonstrations are one variant; its rates are averages over the sets. If a
+    variant was run with different demonstrations of one task and set, the last ones count.
     """
 
     def __init__(self, suite: Suite, episodes: Iterable[Episode]):
@@ -218,8 +209,9 @@ class Summary:
             ]
         self.rows: list[Episode] = [row for rows in self._rows.values() for row in rows]
         known = [variant for variant, rows in self._rows.items() if rows]
-        # whatever the order in which they were asked for, run by run
+        # a fixed order, independent of the order of the runs
         self.variants: list[Variant] = sorted(known, key=lambda variant: ROW_METHODS.index(variant.method))
+        self.labels: dict[Variant, str] = dict(zip(self.variants, labels(self.variants), strict=True))
         self.tasks: list[str] = [task for task in suite.tasks if any(row.scene.task == task for row in self.rows)]
 
     def rows_of(self, variant: Variant, task: str | None = None) -> list[Episode]:
@@ -231,22 +223,24 @@ class Summary:
         rows = self.rows_of(variant, task)
         return Rate(tuple(_means_of_scenes(rows).values()), len(rows)) if rows else None
 
+    def rates(self, variant: Variant, tasks: Iterable[str]) -> list[Rate]:
+        """In those of ``tasks`` in which the variant was tried."""
+        return [rate for task in tasks if (rate := self.rate(variant, task)) is not None]
+
     def of_tasks(self, variant: Variant, beside: Variant | None = None) -> list[float]:
-        """The success rate in each task that the variant was tried in, and ``beside``, if given, was tried in, too."""
-        rates = (
-            self.rate(variant, task) for task in self.tasks if beside is None or self.rate(beside, task) is not None
-        )
-        return [rate.value for rate in rates if rate is not None]
+        """The success rate in each task in which the variant, and ``beside`` if given, was tried."""
+        tasks = (task for task in self.tasks if beside is None or self.rate(beside, task) is not None)
+        return [rate.value for rate in self.rates(variant, tasks)]
 
     def over_tasks(self, variant: Variant) -> tuple[float, float]:
         """Mean and standard deviation of the success rate over tasks."""
         return mean_and_deviation(self.of_tasks(variant))
 
     def interval_over_tasks(self, variant: Variant) -> tuple[float, float]:
-        """95% interval of the mean of `over_tasks`, see `scene_interval`, with one trial a task and set of
+        """95% interval of the mean of `over_tasks`, see `wilson_interval`, with one trial a task and set of
         demonstrations: scenes that share what was shown are no independent trials."""
         clusters = {(row.scene.task, row.variant.demo_set) for row in self._rows[variant]}
-        return scene_interval(self.over_tasks(variant)[0], len(clusters))
+        return wilson_interval(self.over_tasks(variant)[0] * len(clusters), len(clusters))
 
     def of_sets(self, variant: Variant) -> dict[int, float]:
         """For each set of demonstrations the success rate, averaged over tasks."""
@@ -286,12 +280,12 @@ class Summary:
 
 
 def of_any_set(variant: Variant) -> Variant:
-    """What variants have in common that differ in the set of demonstrations only."""
+    """``variant`` without its set of demonstrations."""
     return replace(variant, demo_set=0)
 
 
 def _means_of_scenes(rows: Iterable[Episode]) -> dict[Scene, Fraction]:
-    """The share of executions that succeeded, scene by scene; sets of demonstrations count alike."""
+    """Success rate of each scene: the average over sets of demonstrations."""
     counts: dict[Scene, dict[int, tuple[int, int]]] = {}
     for row in rows:
         of_sets = counts.setdefault(row.scene, {})

@@ -6,7 +6,6 @@ exports; a folder that holds only exports can be read, too.
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import shlex
@@ -23,6 +22,7 @@ from urllib.parse import quote
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from robust_instant_policy.datasets.tables import parquet
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import Failure
@@ -34,6 +34,9 @@ from robust_instant_policy.files import make_folder, open_regular, read_regular,
 RESULTS_FILE = "results.sqlite"
 EPISODES_FILE, FAILURES_FILE = "episodes.parquet", "failures.parquet"
 BUSY_TIMEOUT_S = 60.0  # how long a write waits for another process
+
+SUITES = """CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, level TEXT, content TEXT NOT NULL,
+PRIMARY KEY (name, objects, assets, level))"""
 
 _SQL_TYPES = {str: "TEXT", int: "INTEGER", float: "REAL", bool: "INTEGER"}
 _ARROW_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
@@ -90,7 +93,7 @@ class ResultsStore:
             is_new = not _EPISODES.columns(self._database)
             for table in (_EPISODES, _FAILURES, _INVOCATIONS):
                 table.create(self._database)
-            _create_suites(self._database)
+            self._database.execute(SUITES)
             if is_new:
                 self._take(_read_exports(folder))
 
@@ -274,20 +277,6 @@ _FAILURES = _Table("failures", Failure, _KEY)
 _INVOCATIONS = _Table("invocations", Invocation, _columns_of(Invocation))
 
 
-def _create_suites(database: sqlite3.Connection) -> None:
-    """Make the table of suites, or make it anew from that of a version that knew no levels."""
-    columns = {row[1] for row in database.execute("PRAGMA table_info(suites)")}
-    if columns and "level" not in columns:
-        database.execute("ALTER TABLE suites RENAME TO older_suites")
-    database.execute(
-        "CREATE TABLE IF NOT EXISTS suites (name TEXT, objects TEXT, assets TEXT, level TEXT, content TEXT NOT NULL, "
-        "PRIMARY KEY (name, objects, assets, level))"
-    )
-    if columns and "level" not in columns:
-        database.execute("INSERT INTO suites SELECT name, objects, assets, 'paper', content FROM older_suites")
-        database.execute("DROP TABLE older_suites")
-
-
 def _read(database: sqlite3.Connection) -> Results:
     invocations = sorted(_INVOCATIONS.read(database), key=lambda command: command.began)
     manifest = Manifest(_read_suites(database), tuple(invocations))
@@ -312,9 +301,7 @@ def _write_exports(folder: Path, results: Results) -> None:
         (EPISODES_FILE, _EPISODES, results.episodes),
         (FAILURES_FILE, _FAILURES, results.failures),
     ):
-        buffer = io.BytesIO()
-        pq.write_table(table.arrow(rows), buffer)
-        write_whole(folder / name, buffer.getvalue())
+        write_whole(folder / name, parquet(table.arrow(rows)))
     results.manifest.write(folder / MANIFEST_FILE)
 
 

@@ -26,18 +26,17 @@ DEMOS = (1, 3, 5, 10, 20)
 QUERIES = (2, 3, 5, 10)
 DOFS = (1.25, 1.5, 3.0, math.inf)
 HYPERPARAMETER_DEMOS = 20  # shown where Q and ν are varied
-CHOSEN = "chosen"  # not an analysis of the paper: what the user's tasks and methods say
-SAMPLING_METHODS = ("rip", "rip-gauss", "mean", "kat")  # those that share their samples
+CHOSEN = "chosen"  # not an analysis of the paper: the tasks and methods of the user
+SAMPLING_METHODS = ("rip", "rip-gauss", "mean", "kat")  # they share their samples
 BENCHMARK_METHODS = (REPLAY, "neighbours", "gp", "kat", "rip-gauss", "rip")
-PAPER_METHODS = (*SAMPLING_METHODS, "dp", "kat-dp")  # those that there are in the paper's configuration, by default
+PAPER_METHODS = (*SAMPLING_METHODS, "dp", "kat-dp")  # default methods of the paper's configuration
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Every one of ``variants`` in the new scenes ``seeds`` of every task, with "seen" or "unseen" ``objects``, whose
-    shapes come from ``assets``, at a ``level``, as in `Scene`.
+    """All ``variants`` in the scenes ``seeds`` of all tasks; ``objects``, ``assets`` and ``level`` as in `Scene`.
 
-    At another level than the paper's, "unseen" means the objects of the only set for tasks that have one.
+    At another level than the paper's, tasks with a single set of objects use it for "unseen", too.
     """
 
     name: str
@@ -57,25 +56,22 @@ class Suite:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> Suite:
-        """Of its fields, as `dataclasses.asdict` gives them; a field that came later has its default."""
+        """A suite from the output of `dataclasses.asdict`; missing fields get their defaults."""
         variants = tuple(Variant(**one) for one in content["variants"])
         sequences = {name: tuple(content[name]) for name in ("tasks", "seeds")}
         return cls(**{**content, **sequences, "variants": variants})
 
     @property
     def scenes(self) -> list[Scene]:
-        return [
-            Scene(task, self._objects(task), seed, self.assets, self.level)
-            for task in self.tasks
-            for seed in self.seeds
-        ]
-
-    def _objects(self, task: str) -> str:
-        return self.objects if self.level == "paper" or task in UNSEEN_TASKS else "seen"
+        found = []
+        for task in self.tasks:
+            objects = self.objects if self.level == "paper" or task in UNSEEN_TASKS else "seen"
+            found += [Scene(task, objects, seed, self.assets, self.level) for seed in self.seeds]
+        return found
 
     @property
     def identity(self) -> tuple[str, str, str, str]:
-        """What suites have in common that become one."""
+        """Suites with equal identity are merged."""
         return self.name, self.objects, self.assets, self.level
 
     def with_demonstrations(self, demo_set: int) -> Suite:
@@ -88,14 +84,14 @@ class Suite:
         return self.name == "trajectories"
 
     def by_config(self) -> dict[str, Suite]:
-        """The suite of each configuration by itself; methods for which all configurations are one stand in each."""
+        """One suite for each configuration; methods without a configuration are in each."""
         return {
             config: replace(self, variants=tuple(one for one in self.variants if one.config in (config, "")))
             for config in configs(self.variants)
         }
 
     def by_split(self) -> dict[str, Suite]:
-        """The scenes for tuning and those for tests each by themselves, if there are both, else all under ""."""
+        """One suite for the scenes for tuning and one for those for tests; if there is only one kind, all under ""."""
         parts: dict[str, list[int]] = {}
         for seed in self.seeds:
             parts.setdefault(split_of(seed), []).append(seed)
@@ -115,10 +111,9 @@ class Suite:
 
 @dataclass(frozen=True)
 class Choice:
-    """What the user asked for; None where the suite decides as the paper does, and for the objects of the ``level``.
+    """The user's options; None: as the suite of the paper, ``objects`` as the ``level``.
 
-    ``seed`` is that of the run in ``split``, see `scene_seed`.
-    ``steps`` is how long methods are trained that must be: the ``base`` may be one that need not.
+    ``seed`` is that of the run in ``split``, see `scene_seed`; ``steps`` the training steps of trained methods.
     """
 
     base: Variant

@@ -1,4 +1,4 @@
-"""A method with its settings, and the scenes it is tried in: what identifies a row, whatever run it comes from."""
+"""The key of a row, independent of the run: a method with its settings, and a scene."""
 
 from __future__ import annotations
 
@@ -35,14 +35,13 @@ class Variant:
 
     ``demos`` demonstrations are shown; ``queries`` is the paper's Q, ``dof`` its ν; ``downsampling``, ``frames``,
     ``layout``, ``features``, ``keypoints``, ``column`` and ``estimator`` are those of `Settings`; ``config`` names
-    the configuration that these make: the one of `CONFIGS` that is nearest, with what differs; it is never given;
+    their configuration: the nearest of `CONFIGS`, with the differences (computed, never an argument);
     ``model`` names the language model; ``steps`` is how long a method is trained; ``deadline_s`` bounds the
-    sampling for one plan; with ``replan`` > 0 the method looks again after so many waypoints; ``code`` is the
-    `code_digest` of the package, which stands for every setting that has no name here; ``demonstrations`` the digest of
-    those that were shown, which are of the set ``demo_set`` (see `scenes.first_demonstration_seed`). What a method does
-    not use is always empty (a number None), so that the same work is never done, nor counted, under two names; RIP with
-    ν = ∞ is "rip-gauss", with the estimator "mean" it is "mean". Rows of versions that did not note a setting have it
-    empty, too: unknown.
+    sampling for one plan; with ``replan`` > 0 the method plans again after so many waypoints; ``code`` is the
+    `code_digest` of the package, which covers all settings without a field; ``demonstrations`` is the digest of the
+    demonstrations, which are of the set ``demo_set`` (see `scenes.first_demonstration_seed`). A setting that a method
+    does not use is empty (a number: None), so that no work has two names; RIP with ν = ∞ is "rip-gauss", with the
+    estimator "mean" it is "mean". A setting is also empty in rows of versions that did not store it.
     """
 
     method: str
@@ -101,7 +100,7 @@ class Variant:
 
     @property
     def file_name(self) -> str:
-        """Everything, so that no two variants have the same."""
+        """All settings, so that different variants have different names."""
         features = "" if self.features == "auto" else self.features
         deadline = "" if self.deadline_s is None else f"{self.deadline_s:g}s"
         column = "" if self.column == "auto" else self.column
@@ -109,7 +108,7 @@ class Variant:
         return re.sub(r"[^\w.-]+", "_", "-".join(word for word in words if word))
 
     def __str__(self) -> str:
-        """What a reader chose, without descriptors, language model and versions, in a few words."""
+        """The settings in short, without descriptors, language model and versions."""
         dof = "" if self.dof is None else f"v{self.dof:g}"
         words = (
             self.method,
@@ -137,7 +136,7 @@ _NAMES = ("config", *(field.name for field in fields(Variant) if field.name not 
 
 
 def labels(variants: Sequence[Variant]) -> list[str]:
-    """What tells ``variants`` apart: the method and, in parentheses, the settings in which those of one method differ.
+    """Names of ``variants``: the method and, in parentheses, the settings in which variants of one method differ.
 
     >>> labels([Variant("rip"), Variant("kat", model="a"), Variant("kat", model="b")])
     ['rip', 'kat (model a)', 'kat (model b)']
@@ -158,7 +157,7 @@ def _told(value: str | float | None) -> str:
 
 
 def configs(variants: Sequence[Variant]) -> list[str]:
-    """The configurations of ``variants``, in a fixed order; ``[""]`` for methods for which all are one, such as dp."""
+    """The configurations of ``variants``, in a fixed order; ``[""]`` if no method depends on one, such as dp."""
     known = {variant.config for variant in variants} - {""}
     return sorted(known, key=lambda config: (list(CONFIGS).index(config.split(",")[0]), config)) or [""]
 
@@ -190,7 +189,7 @@ def _differ_within_a_config(variants: Sequence[Variant], name: str) -> bool:
 
 
 def values(variants: Sequence[Variant], value: Callable[[Variant], str]) -> list[str]:
-    """The ``value`` of each where it tells them apart, else their `labels`."""
+    """The ``value`` of each variant if all are different, else their `labels`."""
     told = [value(variant) for variant in variants]
     return told if len(set(told)) == len(told) else labels(variants)
 
@@ -202,7 +201,7 @@ def dof_symbol(variant: Variant) -> str:
 
 
 def by_demos(variants: Sequence[Variant]) -> dict[str, dict[int, Variant]]:
-    """Those that differ in nothing but how much is shown, together: label, then number of demonstrations."""
+    """Groups of variants that differ only in the number of demonstrations: label, then number, then variant."""
     groups: dict[Variant, dict[int, Variant]] = {}
     for variant in variants:
         groups.setdefault(replace(variant, demos=0), {})[variant.demos] = variant
@@ -210,10 +209,9 @@ def by_demos(variants: Sequence[Variant]) -> dict[str, dict[int, Variant]]:
 
 
 def require_no_path(*names: str) -> None:
-    """Raises `InvalidValueError` for one with a slash or two dots.
+    """Raises `InvalidValueError` for a name with a slash or two dots.
 
-    Files are named after ``names``, also those that a run's folder from elsewhere holds, and must stay inside of the
-    folder that they are written to.
+    ``names`` may come from another person's files; files that are named after them must stay inside the run's folder.
     """
     for name in names:
         if not isinstance(name, str) or "/" in name or ".." in name or "\0" in name:

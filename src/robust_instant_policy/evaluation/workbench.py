@@ -17,7 +17,6 @@ from robust_instant_policy.errors import ModelError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import FailureAnalysis, Truth, film, true_keypoints
 from robust_instant_policy.evaluation.rollout import ScenePolicy, roll_out
-from robust_instant_policy.evaluation.scene_policies import RefusingPolicy, ReplayedDemonstrator
 from robust_instant_policy.evaluation.scenes import demonstrations_folder
 from robust_instant_policy.evaluation.variant import REPLAY, Scene, Variant
 from robust_instant_policy.evaluation.work import Analysis, Outcome, Planned, SceneWork, Setup
@@ -43,7 +42,7 @@ from robust_instant_policy.policies.training import TrainingReport, no_report
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.scene_truth import SceneTruth
 from robust_instant_policy.tasks.task import Task, offers, require
-from robust_instant_policy.trajectory import Trajectory
+from robust_instant_policy.trajectory import downsample
 
 if TYPE_CHECKING:  # it needs the extra "train"
     from robust_instant_policy.policies.diffusion.training import TrainedPolicy
@@ -103,7 +102,7 @@ class Workbench:
         self._enter(work.scene)
         self._show(work)
         policy = self._policy(variant)
-        return cast("TrainedPolicy", policy.policy if isinstance(policy, RememberingPolicy) else policy)
+        return cast("TrainedPolicy", policy.fitted if isinstance(policy, ScenePolicy) else policy)
 
     def close(self) -> None:
         if self._task is not None:
@@ -167,13 +166,13 @@ class Workbench:
         plan, self._samples[asked] = policy.plan_from(self._located[key], self._samples.get(asked, NO_SAMPLES))
         return plan
 
-    def _demonstrate(self) -> Trajectory:
-        """What the demonstrator does in the current scene, which is built anew afterwards."""
+    def _demonstrate(self, downsampling: str, _: object) -> Plan:
+        """What the demonstrator does in the current scene, thinned out; the scene is built anew afterwards."""
         assert self._task is not None
         require(self._task, "demonstrate")
         shown = self._task.demonstrate(self._seed).demonstration.trajectory
         self._task.reset(self._seed)
-        return shown
+        return Plan.of(downsample(shown, downsampling))
 
     def _settings(self, variant: Variant) -> Settings:
         assert self._task is not None
@@ -187,28 +186,30 @@ class Workbench:
 
     def _policy(self, variant: Variant) -> ScenePolicy | ClosedLoopPolicy:
         if variant not in self._policies:
-            training = None
-            if variant.steps is not None:
-                training = Training(self._setup.checkpoints, variant.steps, report=self._report)
-            model = cast(LanguageModel, _Later(self))
-            if variant.method == REPLAY:
-                self._policies[variant] = ReplayedDemonstrator(self._demonstrate, variant.downsampling)
-                return self._policies[variant]
-            policy = make_policy(variant.method, model, self._settings(variant), training, self._setup.deadline_s)
-            if isinstance(policy, KeypointPolicy):
-                try:
-                    policy.fit_context(self.context(variant.demos, policy.settings))
-                    self._policies[variant] = (
-                        Replanning(policy, variant.replan)
-                        if variant.replan
-                        else RememberingPolicy(self, policy, variant.demos)
-                    )
-                except UNPLANNABLE as error:
-                    self._policies[variant] = RefusingPolicy(error)
-            else:  # in closed loop; what it has after `fit` only makes it no `ClosedLoopPolicy` for isinstance yet
-                shown = self._read_demonstrations(self._place[0], variant.demos, with_images=True)
-                self._policies[variant] = cast(ClosedLoopPolicy, policy).fit(shown)
+            self._policies[variant] = self._fitted(variant)
         return self._policies[variant]
+
+    def _fitted(self, variant: Variant) -> ScenePolicy | ClosedLoopPolicy:
+        if variant.method == REPLAY:
+            replay = partial(self._demonstrate, variant.downsampling)
+            return ScenePolicy(replay, replay)
+        training = None
+        if variant.steps is not None:
+            training = Training(self._setup.checkpoints, variant.steps, report=self._report)
+        model = cast(LanguageModel, _Later(self))
+        policy = make_policy(variant.method, model, self._settings(variant), training, self._setup.deadline_s)
+        if not isinstance(policy, KeypointPolicy):  # closed loop; it satisfies `ClosedLoopPolicy` only after `fit`
+            shown = self._read_demonstrations(self._place[0], variant.demos, with_images=True)
+            return cast(ClosedLoopPolicy, policy).fit(shown)
+        try:
+            policy.fit_context(self.context(variant.demos, policy.settings))
+        except UNPLANNABLE as error:
+            refused = partial(_refused, error)
+            return ScenePolicy(refused, refused)
+        if variant.replan:
+            return Replanning(policy, variant.replan)
+        remembering = partial(self.plan, policy, variant.demos)  # uses the cache of the current scene
+        return ScenePolicy(remembering, policy.plan_scene, policy.executions, policy)
 
     def _analyse(
         self, task: Task, scene: Scene, failed: Sequence[Episode], observation: Observation
@@ -261,21 +262,9 @@ class Workbench:
         return self._shown_truth[:demos]
 
 
-class RememberingPolicy:
-    """A fitted policy that uses the workbench's cache of the current scene."""
-
-    def __init__(self, bench: Workbench, policy: KeypointPolicy, demos: int):
-        self._bench, self.policy, self._demos = bench, policy, demos
-
-    def plan(self, observation: Observation) -> Plan:
-        return self._bench.plan(self.policy, self._demos, observation)
-
-    def plan_scene(self, scene: LocatedScene) -> Plan:
-        """Plan from given keypoints, without the cache."""
-        return self.policy.plan_scene(scene)
-
-    def executions(self, plan: Plan) -> tuple[Trajectory, ...]:
-        return self.policy.executions(plan)
+def _refused(error: Exception, _: object) -> Plan:
+    """The plan of a policy that cannot be fitted to the demonstrations."""
+    raise error
 
 
 class _Later:

@@ -1,4 +1,4 @@
-"""Tables and figure of a benchmark of other people: by group of difficulty beside published numbers, by task, and the
+"""Tables and figure of a published benchmark: success by group of difficulty beside published numbers and by task, and
 failures by stage."""
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import Failure
 from robust_instant_policy.evaluation.statistics import Summary
-from robust_instant_policy.evaluation.variant import REPLAY, Variant, labels
+from robust_instant_policy.evaluation.variant import REPLAY, Variant
 from robust_instant_policy.reporting.figures import HEIGHT_IN, PARAMETERS, WIDTH_IN, style_of, success_axis
 from robust_instant_policy.reporting.tables import NONE, Table
 from robust_instant_policy.tasks.benchmark import Benchmark
@@ -40,12 +39,11 @@ def group_table(benchmark: Benchmark, summary: Summary) -> Table:
     groups = {f"{name} ({len(tasks)})": tasks for name, tasks in benchmark.groups.items()}
     measured = [task for task in benchmark.tasks if task not in benchmark.tuning]
     parts = {f"tuning ({len(benchmark.tuning)})": benchmark.tuning, f"measuring ({len(measured)})": measured}
-    if not benchmark.tuning:
-        parts = {}
+    parts = parts if benchmark.tuning else {}
     sets = {variant: summary.of_sets(variant) for variant in summary.variants}
     several = any(len(rates) > 1 for rates in sets.values())
     rows = []
-    for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
+    for variant, label in summary.labels.items():
         rates = [_mean(summary, variant, tasks) for tasks in groups.values()]
         known = [rate for rate in rates if rate is not None]
         cells = [_cell(summary, variant, tasks) for tasks in groups.values()]
@@ -78,14 +76,11 @@ def task_table(benchmark: Benchmark, summary: Summary) -> Table:
         for task in tasks:
             if task not in summary.tasks:
                 continue
-            name = task.removeprefix(f"{benchmark.name}/") + (TUNED if task in benchmark.tuning else "")
-            cells = []
-            for variant in summary.variants:
-                rate = summary.rate(variant, task)
-                cells.append(NONE if rate is None else f"{100 * rate.value:.0f}")
-            rows.append((name, group, *cells))
+            rates = (summary.rate(variant, task) for variant in summary.variants)
+            cells = [NONE if rate is None else f"{100 * rate.value:.0f}" for rate in rates]
+            rows.append((_name(benchmark, task), group, *cells))
     note = ("Success in percent.", _conditions(summary), _extent(summary), _reading(benchmark, summary))
-    return Table(("task", "group", *labels(summary.variants)), tuple(rows), " ".join(filter(None, note)))
+    return Table(("task", "group", *summary.labels.values()), tuple(rows), " ".join(filter(None, note)))
 
 
 def loss_table(benchmark: Benchmark, summary: Summary, failures: Sequence[Failure]) -> Table | None:
@@ -93,11 +88,11 @@ def loss_table(benchmark: Benchmark, summary: Summary, failures: Sequence[Failur
     known = {failure.key: failure for failure in failures}
     rows, examined = [], False
     for task in summary.tasks:
-        for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
+        for variant, label in summary.labels.items():
             own = [row for row in summary.rows_of(variant, task) if not row.success]
             if variant.method == REPLAY or not own:
                 continue
-            moved = [known.get(row.key) for row in own if not _is_refused(row)]
+            moved = [known.get(row.key) for row in own if row.executed_seconds > 0]  # else it was refused
             found = [failure for failure in moved if failure is not None]
             examined = examined or bool(found)
             stages = ["keypoints" if failure.keypoint_error == 0 else failure.stage for failure in found]
@@ -105,8 +100,8 @@ def loss_table(benchmark: Benchmark, summary: Summary, failures: Sequence[Failur
             counts = [len(own) - len(moved), *(sum(map(stages.count, which)) for which in LOST.values())]
             cells = [str(count or NONE) for count in (*counts, len(own) - sum(counts))]
             off = f"{np.median(errors):.0f}" if errors else NONE
-            name = task.removeprefix(f"{benchmark.name}/") + (TUNED if task in benchmark.tuning else "")
-            rows.append((name, label, f"{len(own)} of {len(summary.rows_of(variant, task))}", *cells, off))
+            failed = f"{len(own)} of {len(summary.rows_of(variant, task))}"
+            rows.append((_name(benchmark, task), label, failed, *cells, off))
     if not examined:
         return None
     note = (
@@ -120,8 +115,8 @@ def loss_table(benchmark: Benchmark, summary: Summary, failures: Sequence[Failur
     return Table(head, tuple(rows), note)
 
 
-def _is_refused(row: Episode) -> bool:
-    return row.executed_seconds == 0
+def _name(benchmark: Benchmark, task: str) -> str:
+    return task.removeprefix(f"{benchmark.name}/") + (TUNED if task in benchmark.tuning else "")
 
 
 def benchmark_figure(benchmark: Benchmark, summary: Summary) -> Figure:
@@ -132,7 +127,7 @@ def benchmark_figure(benchmark: Benchmark, summary: Summary) -> Figure:
         bars: list[tuple[str, Sequence[float], dict[str, Any]]] = []
         for name, grey in zip(benchmark.published, PUBLISHED_GREYS, strict=False):
             bars.append((f"{name}, published", benchmark.published[name], {"color": grey}))
-        for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
+        for variant, label in summary.labels.items():
             rates = [_mean(summary, variant, tasks) for tasks in benchmark.groups.values()]
             style = style_of(variant)
             look: dict[str, Any] = {"color": style.colour, "hatch": style.hatch, "edgecolor": "black", "linewidth": 0.5}
@@ -152,16 +147,16 @@ def benchmark_figure(benchmark: Benchmark, summary: Summary) -> Figure:
 
 def _mean(summary: Summary, variant: Variant, tasks: Sequence[str]) -> float | None:
     """Success in percent, averaged over those of ``tasks`` that were tried; None without any."""
-    rates = [rate.value for task in tasks if (rate := summary.rate(variant, task)) is not None]
-    return 100 * fmean(rates) if rates else None
+    rates = summary.rates(variant, tasks)
+    return 100 * fmean(rate.value for rate in rates) if rates else None
 
 
 def _cell(summary: Summary, variant: Variant, tasks: Sequence[str]) -> str:
-    """`_mean`, and in parentheses of how many tasks where it is not of all."""
+    """`_mean`; in parentheses the number of tasks, if not all were tried."""
     mean = _mean(summary, variant, tasks)
     if mean is None:
         return NONE
-    tried = sum(summary.rate(variant, task) is not None for task in tasks)
+    tried = len(summary.rates(variant, tasks))
     return f"{mean:.1f}" + (f" (of {tried})" if tried < len(tasks) else "")
 
 
@@ -175,11 +170,11 @@ def _conditions(summary: Summary) -> str:
 
 
 def _extent(summary: Summary) -> str:
-    """How many scenes and sets of demonstrations the numbers of each method are of."""
+    """Number of scenes and sets of demonstrations of each method."""
     told: dict[str, list[str]] = {}
-    for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
-        rates = [rate for task in summary.tasks if (rate := summary.rate(variant, task)) is not None]
-        scenes, sets = {rate.scenes for rate in rates}, len(summary.of_sets(variant))
+    for variant, label in summary.labels.items():
+        scenes = {rate.scenes for rate in summary.rates(variant, summary.tasks)}
+        sets = len(summary.of_sets(variant))
         count = f"{min(scenes)}" + (f" to {max(scenes)}" if len(scenes) > 1 else "")
         words = f"{count} scene{'s' if scenes != {1} else ''} a task"
         if sets > 1:

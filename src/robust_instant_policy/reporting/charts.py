@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,15 @@ from plotly.subplots import make_subplots
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.policies.policy import Plan
-from robust_instant_policy.reporting.pictures import keypoint_colour, scene_points, tool_points
+from robust_instant_policy.reporting.pictures import keypoint_colour
 from robust_instant_policy.robots.path import MeasuredPath, Sweep
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
 MM = 1000.0
 AXIS_STEPS = 6  # gripper axes drawn along the robust trajectory
 AXIS_LENGTH_M = 0.03
-AXES = (("#d62728", "gripper x"), ("#2ca02c", "gripper y (opening)"), ("#1f77b4", "gripper z (approach)"))
+AXIS_COLOURS = ("#d62728", "#2ca02c", "#1f77b4")  # of x, y and z
+AXIS_NAMES = ("gripper x", "gripper y (opening)", "gripper z (approach)")
 CAMERA = {"eye": {"x": 1.5, "y": -1.6, "z": 1.2}, "center": {"x": 0, "y": 0, "z": -0.2}}  # shows all of it
 COLUMNS = 3  # of charts side by side
 MAX_POINTS = 8_000  # of the point cloud under the paths
@@ -49,64 +51,44 @@ def candidate_colour(plan: Plan, index: int) -> str:
 def paths_in_space(plan: Plan, observation: Observation) -> go.Figure:
     """Paths between the fingertips in the world, candidates coloured by weight, with the gripper's axes along the
     robust one and what its fingertips sweep, over the points that the camera saw."""
-    figure = go.Figure()
-    points, colours = scene_points(observation, MAX_POINTS)
-    look = {"size": 2, "color": [f"rgb({r},{g},{b})" for r, g, b in colours]}
-    _add_points(figure, points.astype(np.float32), mode="markers", name="camera", marker=look, hoverinfo="skip")
+    figure = _seen(observation)
     for index, candidate in enumerate(plan.candidates):
         weight = np.interp(candidate.times, plan.trajectory.times, plan.weights[index])
         shade = {"color": weight, "colorscale": WEIGHT_COLOURS, "cmin": 0, "cmax": 1}
+        marker = {"size": 3, "symbol": "x" if plan.hallucinated[index] else "circle", "colorbar": _bar("weight", 0.6)}
         for arm in range(candidate.num_arms):
             _add_points(
                 figure,
-                tool_points(candidate, arm),
+                candidate.tool_points[:, arm],
+                candidate_name(plan, index),
+                in_legend=False,
                 mode="lines+markers",
-                name=candidate_name(plan, index),
-                showlegend=False,
                 line={**shade, "width": 4},
-                marker={
-                    **shade,
-                    "size": 3,
-                    "symbol": "x" if plan.hallucinated[index] else "circle",
-                    "showscale": index == 0 and arm == 0,
-                    "colorbar": {"title": "weight", "thickness": 14, "len": 0.6},
-                },
+                marker={**shade, **marker, "showscale": index == 0 and arm == 0},
                 customdata=np.stack([weight, np.arange(len(candidate))], axis=1),
                 hovertemplate="step %{customdata[1]:.0f}, weight %{customdata[0]:.2f}<extra>%{fullData.name}</extra>",
             )
     for arm in range(plan.trajectory.num_arms):
         _add_robust_path(figure, plan, arm)
     keypoints = plan.keypoints.reshape(-1, 3)
-    _add_points(
-        figure,
-        keypoints,
-        mode="markers+text",
-        name="keypoints",
-        text=[str(k) for k in range(len(keypoints))],
-        marker={"size": 5, "color": [keypoint_colour(k) for k in range(len(keypoints))]},
-    )
+    numbers = range(len(keypoints))
+    dots = {"size": 5, "color": [keypoint_colour(k) for k in numbers]}
+    _add_points(figure, keypoints, "keypoints", mode="markers+text", text=[str(k) for k in numbers], marker=dots)
     return _in_space(figure)
 
 
 def swept_space(sweep: Sweep, observation: Observation) -> go.Figure:
     """The path between the fingertips from where the arms are parked, and the arms' links along it, pale at first and
     dark at the end, over the points that the camera saw."""
-    figure = go.Figure()
-    points, colours = scene_points(observation, MAX_POINTS)
-    look = {"size": 2, "color": [f"rgb({r},{g},{b})" for r, g, b in colours]}
-    _add_points(figure, points.astype(np.float32), mode="markers", name="camera", marker=look, hoverinfo="skip")
+    figure = _seen(observation)
     gap = np.full((*sweep.links.shape[:2], 1, 3), np.nan)  # between the lines of two links
-    lines = np.concatenate([sweep.links, gap], axis=2).reshape(-1, 3)
+    links = np.concatenate([sweep.links, gap], axis=2).reshape(-1, 3)
     seconds = np.repeat(sweep.seconds, 3 * sweep.links.shape[1])
-    shade = {
-        "color": seconds,
-        "colorscale": WEIGHT_COLOURS,
-        "colorbar": {"title": "seconds", "thickness": 14, "len": 0.6},
-    }
-    _add_points(figure, lines, mode="lines", name="links of the arms", line={**shade, "width": 6}, hoverinfo="skip")
+    line = {"width": 6, "color": seconds, "colorscale": WEIGHT_COLOURS, "colorbar": _bar("seconds", 0.6)}
+    _add_points(figure, links, "links of the arms", line=line, hoverinfo="skip")
     for arm in range(sweep.tools.shape[1]):
-        look = {"line": {"color": ROBUST_COLOUR, "width": 6}, "showlegend": arm == 0, "legendgroup": "tool"}
-        _add_points(figure, sweep.tools[:, arm], mode="lines", name="between the fingertips", **look)
+        line = {"color": ROBUST_COLOUR, "width": 6}
+        _add_points(figure, sweep.tools[:, arm], "between the fingertips", arm == 0, line=line)
     return _in_space(figure)
 
 
@@ -114,64 +96,61 @@ def executed_paths(plan: Plan, path: MeasuredPath) -> go.Figure:
     """The planned trajectory, and the commanded and measured paths between the fingertips, in the world."""
     figure = go.Figure()
     for arm in range(plan.trajectory.num_arms):
-        first = arm == 0
-        planned = {"mode": "markers", "name": "planned", "marker": {"color": ROBUST_COLOUR, "size": 3}}
-        _add_points(figure, tool_points(plan.trajectory, arm), showlegend=first, legendgroup="planned", **planned)
+        marker = {"color": ROBUST_COLOUR, "size": 3}
+        _add_points(figure, plan.trajectory.tool_points[:, arm], "planned", arm == 0, mode="markers", marker=marker)
         for points, name, colour in (
             (path.commanded_tools, "commanded", CANDIDATE_COLOURS[0]),
             (path.measured_tools, "measured", HALLUCINATED_COLOUR),
         ):
-            look = {"mode": "lines", "line": {"color": colour, "width": 4}, "legendgroup": name}
-            _add_points(figure, points[:, arm], name=name, showlegend=first, **look)
+            _add_points(figure, points[:, arm], name, arm == 0, line={"color": colour, "width": 4})
     return _in_space(figure)
+
+
+def _seen(observation: Observation) -> go.Figure:
+    """The points that the camera saw."""
+    figure = go.Figure()
+    points, colours = observation.points(MAX_POINTS)
+    marker = {"size": 2, "color": [f"rgb({r},{g},{b})" for r, g, b in colours]}
+    _add_points(figure, points.astype(np.float32), "camera", mode="markers", marker=marker, hoverinfo="skip")
+    return figure
 
 
 def _in_space(figure: go.Figure) -> go.Figure:
     axes = {f"{axis}axis_title": f"world {axis} [mm]" for axis in "xyz"}
     figure.update_layout(
-        height=620,
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        legend={"x": 0, "y": 1},
+        height=620, margin=dict.fromkeys("lrtb", 0), legend={"x": 0, "y": 1},
         scene={"aspectmode": "data", "camera": CAMERA, **axes},
-    )
+    )  # fmt: skip
     return figure
 
 
-def _add_points(figure: go.Figure, points: FloatArray, **look: Any) -> None:
-    """``points (N, 3)`` in metres, drawn in millimetres."""
+def _bar(title: str, length: float = 1.0) -> dict[str, Any]:
+    """A bar with the colours' meaning."""
+    return {"title": title, "thickness": 14, "len": length}
+
+
+def _add_points(
+    figure: go.Figure, points: FloatArray, name: str, in_legend: bool = True, mode: str = "lines", **look: Any
+) -> None:
+    """``points (N, 3)`` in metres, drawn in millimetres; those of one name are shown and hidden together."""
     x, y, z = (points * MM).T
-    figure.add_scatter3d(x=x, y=y, z=z, **look)
+    figure.add_scatter3d(x=x, y=y, z=z, name=name, legendgroup=name, showlegend=in_legend, mode=mode, **look)
 
 
 def _add_robust_path(figure: go.Figure, plan: Plan, arm: int) -> None:
-    _add_points(
-        figure,
-        tool_points(plan.trajectory, arm),
-        mode="lines+markers",
-        name="robust trajectory",
-        legendgroup="robust",
-        showlegend=arm == 0,
-        line={"color": ROBUST_COLOUR, "width": 9},
-        marker={"color": ROBUST_COLOUR, "size": 3},
-    )
+    line, marker = {"color": ROBUST_COLOUR, "width": 9}, {"color": ROBUST_COLOUR, "size": 3}
+    points = plan.trajectory.tool_points[:, arm]
+    _add_points(figure, points, "robust trajectory", arm == 0, "lines+markers", line=line, marker=marker)
     triplets = plan.trajectory.triplets[:, arm]
     for finger in (1, 2):
-        look = {"mode": "lines", "line": {"color": ROBUST_COLOUR, "width": 3, "dash": "dot"}, "legendgroup": "swept"}
-        _add_points(figure, triplets[:, finger], name="its fingertips", showlegend=arm == 0 and finger == 1, **look)
+        line = {"color": ROBUST_COLOUR, "width": 3, "dash": "dot"}
+        _add_points(figure, triplets[:, finger], "its fingertips", arm == 0 and finger == 1, line=line)
     poses = GripperTriangle.from_triplets(triplets).poses(triplets)
     for step in np.unique(np.linspace(0, len(poses) - 1, AXIS_STEPS).astype(int)):
         origin, rotation = poses[step, :3, 3], poses[step, :3, :3]
-        for axis, (colour, name) in enumerate(AXES):
-            _add_points(
-                figure,
-                np.stack([origin, origin + AXIS_LENGTH_M * rotation[:, axis]]),
-                mode="lines",
-                line={"color": colour, "width": 5},
-                name=name,
-                legendgroup=name,
-                showlegend=bool(step == 0 and arm == 0),
-                hoverinfo="name",
-            )
+        for axis, (colour, name) in enumerate(zip(AXIS_COLOURS, AXIS_NAMES, strict=True)):
+            ends, first = np.stack([origin, origin + AXIS_LENGTH_M * rotation[:, axis]]), bool(step == 0 and arm == 0)
+            _add_points(figure, ends, name, first, line={"color": colour, "width": 5}, hoverinfo="name")
 
 
 def weights_over_time(plan: Plan) -> go.Figure:
@@ -180,7 +159,7 @@ def weights_over_time(plan: Plan) -> go.Figure:
     figure = go.Figure(
         go.Heatmap(
             z=plan.weights, x=list(range(plan.weights.shape[1])), y=names, zmin=0, zmax=1, colorscale=WEIGHT_COLOURS,
-            colorbar={"title": "weight", "thickness": 14}, xgap=1, ygap=2,
+            colorbar=_bar("weight"), xgap=1, ygap=2,
             hovertemplate="%{y}, step %{x}: weight %{z:.2f}<extra></extra>",
         )
     )  # fmt: skip
@@ -208,43 +187,19 @@ def dimensions_over_time(plan: Plan) -> go.Figure:
     for dimension in range(len(names)):
         unit = 1.0 if dimension % ACTION_DIM == STATE_INDEX else MM
         place = {"row": dimension // COLUMNS + 1, "col": dimension % COLUMNS + 1}
-        first = dimension == 0
+        add = partial(figure.add_scatter, mode="lines", showlegend=dimension == 0, **place)
         mean, scale = plan.trajectory.actions[:, dimension] * unit, plan.scale[:, dimension] * unit
         if scale.any():
-            figure.add_scatter(
-                x=np.concatenate([times, times[::-1]]),
-                y=np.concatenate([mean + scale, (mean - scale)[::-1]]),
-                fill="toself",
-                fillcolor="rgba(0,0,0,0.13)",
-                line={"width": 0},
-                hoverinfo="skip",
-                name="robust mean ± scale",
-                legendgroup="band",
-                showlegend=first,
-                **place,
-            )
+            x, y = np.concatenate([times, times[::-1]]), np.concatenate([mean + scale, (mean - scale)[::-1]])
+            band = {"fill": "toself", "fillcolor": "rgba(0,0,0,0.13)", "line": {"width": 0}, "hoverinfo": "skip"}
+            add(x=x, y=y, name="robust mean ± scale", legendgroup="band", **band)
         for index, candidate in enumerate(plan.candidates):
             dash = "dot" if plan.hallucinated[index] else "solid"
-            figure.add_scatter(
-                x=candidate.times,
-                y=candidate.actions[:, dimension] * unit,
-                mode="lines",
-                line={"color": candidate_colour(plan, index), "width": 1.6, "dash": dash},
-                name=candidate_name(plan, index),
-                legendgroup=str(index),
-                showlegend=first,
-                **place,
-            )
-        figure.add_scatter(
-            x=times,
-            y=mean,
-            mode="lines",
-            line={"color": ROBUST_COLOUR, "width": 2.6},
-            name="robust mean",
-            legendgroup="mean",
-            showlegend=first,
-            **place,
-        )
+            line = {"color": candidate_colour(plan, index), "width": 1.6, "dash": dash}
+            values = candidate.actions[:, dimension] * unit
+            add(x=candidate.times, y=values, name=candidate_name(plan, index), legendgroup=str(index), line=line)
+        line = {"color": ROBUST_COLOUR, "width": 2.6}
+        add(x=times, y=mean, name="robust mean", legendgroup="mean", line=line)
         figure.update_xaxes(title_text="normalised time" if place["row"] == rows else None, **place)
     figure.update_layout(
         height=210 * rows + 60,

@@ -7,17 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.geometry import FloatArray, project
+from robust_instant_policy.geometry import project
 from robust_instant_policy.reporting.pages import render
-from robust_instant_policy.reporting.pictures import (
-    REFERENCE_WIDTH,
-    Line,
-    Mark,
-    Picture,
-    picture,
-    svg_points,
-    tool_points,
-)
+from robust_instant_policy.reporting.pictures import REFERENCE_WIDTH, Line, Mark, Picture, picture, svg_points
 from robust_instant_policy.reporting.tables import NONE, Table
 from robust_instant_policy.sanity import Finding, SetReport, errors
 from robust_instant_policy.sanity.contact import GripperPath
@@ -103,14 +95,9 @@ def _picture(observation: Observation, caption: str, demonstration: Demonstratio
     if demonstration is not None:
         scale = width / REFERENCE_WIDTH
         for arm in range(demonstration.trajectory.num_arms):
-            points = svg_points(tool_points(demonstration.trajectory, arm), observation)
+            points = svg_points(demonstration.trajectory.tool_points[:, arm], observation)
             lines.append(Line(points, PATH_COLOUR, 1.2 * scale, title="middle of the fingertips"))
-        marks = _grasps(GripperPath.of(demonstration.trajectory).closings, observation)
+        closings = GripperPath.of(demonstration.trajectory).closings.reshape(-1, 3)
+        pixels = project(closings, observation.intrinsics, observation.camera_pose) + 0.5
+        marks = [Mark(float(u), float(v), "", GRASP_COLOUR, "a gripper closes here") for u, v in pixels]
     return picture(rgb.astype(np.uint8), caption, lines, marks)
-
-
-def _grasps(closings: FloatArray, observation: Observation) -> list[Mark]:
-    if not len(closings):
-        return []
-    pixels = project(closings, observation.intrinsics, observation.camera_pose) + 0.5
-    return [Mark(float(u), float(v), "", GRASP_COLOUR, "a gripper closes here") for u, v in pixels]

@@ -1,4 +1,4 @@
-"""Which of the paper's numbers may stand beside rows of one's own."""
+"""Where the paper's numbers may be shown beside measured ones."""
 
 from __future__ import annotations
 
@@ -16,14 +16,11 @@ def is_comparable(summary: Summary) -> bool:
 
 
 def paper_rate(summary: Summary, variant: Variant, task: str) -> int | None:
-    """The paper's success rate in percent for a ``variant`` of ``summary`` with the settings of Table I, or of a method
-    (such as dp) that is the same in all configurations and stands beside ones in the paper's; else None.
+    """The paper's success rate in percent for a ``variant`` with the settings of Table I, or for a method without a
+    configuration (such as dp), in a comparable ``summary``; else None.
     """
-    same = not variant.config or (variant.config in PAPER_CONFIGS and _is_of_table1(variant))
+    usual = Variant(variant.method)  # of Table I
+    settings = ("demos", "queries", "dof", "downsampling")
+    is_usual = all(getattr(variant, name) == getattr(usual, name) for name in settings)
+    same = not variant.config or (variant.config in PAPER_CONFIGS and is_usual)
     return table1(variant.method, task) if same and is_comparable(summary) else None
-
-
-def _is_of_table1(variant: Variant) -> bool:
-    """Whether it has the paper's number of demonstrations and samples, ν and downsampling."""
-    usual = Variant(variant.method)
-    return all(getattr(variant, name) == getattr(usual, name) for name in ("demos", "queries", "dof", "downsampling"))

@@ -17,7 +17,7 @@ from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import read_regular, write_whole
 from robust_instant_policy.reporting.pages import data_uri, png, render
-from robust_instant_policy.reporting.pictures import REFERENCE_WIDTH, Line, Picture, picture, svg_points, tool_points
+from robust_instant_policy.reporting.pictures import REFERENCE_WIDTH, Line, Picture, picture, svg_points
 
 MAX_POINTS = 240  # of a path that are drawn
 COORDINATE_DIGITS = 4  # 0.1 mm
@@ -115,7 +115,7 @@ def _paths(demo: Demonstration) -> dict[str, object]:
         "seconds": demo.seconds,
         "arms": [
             {
-                "points": np.round(tool_points(demo.trajectory, arm)[steps], COORDINATE_DIGITS).tolist(),
+                "points": np.round(demo.trajectory.tool_points[steps, arm], COORDINATE_DIGITS).tolist(),
                 "grippers": np.round(triplets[:, arm], COORDINATE_DIGITS).tolist(),
                 "closed": closed[:, arm].astype(int).tolist(),
             }
@@ -126,7 +126,7 @@ def _paths(demo: Demonstration) -> dict[str, object]:
 
 def _card(demo: Demonstration, video: str) -> EpisodeCard:
     depth, caption = _depth_picture(demo.observation.depth)
-    heights = demo.trajectory.triplets[:, :, 1:, 2].mean(axis=2)
+    heights = demo.trajectory.tool_points[..., 2]
     seed = () if demo.seed is None else (f"seed {demo.seed}",)
     return EpisodeCard(
         facts=(
@@ -149,7 +149,7 @@ def _path_over_image(demo: Demonstration) -> list[Line]:
     unit = demo.observation.rgb.shape[1] / REFERENCE_WIDTH
     lines = []
     for arm in range(demo.trajectory.num_arms):
-        points = tool_points(demo.trajectory, arm)
+        points = demo.trajectory.tool_points[:, arm]
         for start, stop, closed in _stretches(demo.trajectory.gripper_state[:, arm] > 0.5):
             line = svg_points(points[start : stop + 1], demo.observation)
             # White below the colour, so that the path stands out from any table.
@@ -162,7 +162,7 @@ def _strip_arm(demo: Demonstration, arm: int) -> StripArm:
     count, share = len(demo.trajectory), STRIP_HEIGHT / demo.trajectory.num_arms
     across = np.linspace(0, STRIP_WIDTH, count)
     top, bottom = arm * share + 4, (arm + 1) * share - 2
-    height = tool_points(demo.trajectory, arm)[:, 2]
+    height = demo.trajectory.tool_points[:, arm, 2]
     scaled = (height - height.min()) / max(np.ptp(height), 1e-9)
     down = bottom - 4 - scaled * (bottom - top - 8)
     return StripArm(

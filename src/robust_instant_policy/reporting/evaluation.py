@@ -51,8 +51,8 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class Section:
-    """One suite in one configuration: its name and level, the ``config``, the ``kinds`` of its objects where they are
-    not the level's usual ones, its figure as SVG and its tables; ``split`` of its scenes where a run has both.
+    """One suite in one configuration: name, level, ``config``, ``kinds`` of objects if they are not the level's usual
+    ones, figure as SVG, tables, and the ``split`` of the scenes if the run has both.
     """
 
     name: str

@@ -19,7 +19,7 @@ from matplotlib.patches import Patch
 
 from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.statistics import Summary
-from robust_instant_policy.evaluation.variant import Scene, Variant, by_demos, dof_symbol, labels, values
+from robust_instant_policy.evaluation.variant import Scene, Variant, by_demos, dof_symbol, values
 from robust_instant_policy.policies import Plan
 from robust_instant_policy.reporting.comparison import is_comparable, paper_rate
 
@@ -46,7 +46,7 @@ PARAMETERS = {
 
 @dataclass(frozen=True)
 class Style:
-    """How a method is drawn: brightness, hatch, marker and line differ, so that colour is not needed."""
+    """How a method is drawn. Brightness, hatch, marker and line differ, so that colour is not needed."""
 
     colour: str
     hatch: str
@@ -90,7 +90,7 @@ def encode(figure: Figure, form: str) -> bytes:
 def _success_bars(summary: Summary) -> Figure:
     groups = [*summary.tasks, AVERAGE]
     num_rows = -(-len(groups) // GROUPS_A_ROW)
-    names = labels(summary.variants)
+    names = list(summary.labels.values())
     columns = max(1, min(4, LEGEND_CHARACTERS // (max(map(len, names)) + HANDLE_CHARACTERS)))
     more_rows = max(0, -(-len(names) // columns) - LEGEND_ROWS)
     height = HEIGHT_IN * num_rows + LEGEND_ROW_IN * more_rows
@@ -147,7 +147,7 @@ def _paper_percent(summary: Summary, variant: Variant, group: str) -> float | No
     if group != AVERAGE:
         return paper_rate(summary, variant, group)
     tried = [task for task in summary.tasks if summary.rate(variant, task) is not None]
-    known = [paper_number for task in tried if (paper_number := paper_rate(summary, variant, task)) is not None]
+    known = [rate for task in tried if (rate := paper_rate(summary, variant, task)) is not None]
     return fmean(known) if len(known) == len(tried) else None
 
 
@@ -175,7 +175,7 @@ def _demos(summary: Summary) -> Figure:
     groups = by_demos(summary.variants)
     for number, (label, of_count) in enumerate(groups.items()):
         shown = [of_count[count] for count in sorted(of_count)]
-        # a little apart, so that methods that do equally well can be told apart
+        # shifted, so that equal curves do not cover each other
         places = [counts.index(one.demos) + 0.06 * (number - (len(groups) - 1) / 2) for one in shown]
         _curve(axes, summary, shown, places, style_of(shown[0]), label)
     axes.set_xticks(range(len(counts)), [str(count) for count in counts])
@@ -263,8 +263,8 @@ def _trajectories(summary: Summary, plans: Mapping[tuple[Scene, Variant], Plan])
             )  # fmt: skip
         panel.set_xlabel("time, share of the episode")
         panel.set_ylabel(f"gripper {'xyz'[axis]} [mm]")
-    handles, labels = panels[0].get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
+    handles, names = panels[0].get_legend_handles_labels()
+    unique = dict(zip(names, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=len(unique))
     panels[1].set_title(f"{scene.task}, scene {scene.seed}", fontsize=8)
     return figure

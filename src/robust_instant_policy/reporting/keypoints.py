@@ -27,9 +27,9 @@ def keypoints_page(
     accuracy: Accuracy | None = None,
     title: str = "Keypoints",
 ) -> str:
-    """HTML of a fitted ``extractor``: its ``demonstrations`` with the numbered keypoints of each, coloured by object,
-    with the share of what was left out and why; and new ``scenes`` with what it locates there (circles: the true
-    positions, where ``accuracy`` knows them).
+    """HTML of a fitted ``extractor``: ``demonstrations`` with numbered keypoints, tinted objects, and the share of
+    pixels that were left out and why; and ``scenes`` with the located keypoints (circles: true positions, if
+    ``accuracy`` is given).
     """
     pairs = zip(demonstrations, extractor.pixels_, strict=True)
     return render(
@@ -69,7 +69,7 @@ def _demonstration(extractor: KeypointExtractor, observation: Observation, index
 
 
 def _colour(number: int) -> str:
-    """Of an object, apart from the keypoints' colours."""
+    """Colour of an object; other than those of keypoints."""
     red, green, blue = colorsys.hsv_to_rgb((number * GOLDEN) % 1, 0.9, 1.0)
     return f"#{round(255 * red):02x}{round(255 * green):02x}{round(255 * blue):02x}"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import re
 from typing import Any
 
@@ -12,6 +11,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 from PIL import Image
+
+from robust_instant_policy.datasets.images import encode_image
 
 JPEG_QUALITY = 88
 PNG_COLOURS = 256
@@ -29,16 +30,13 @@ def data_uri(content: bytes, kind: str) -> str:
 
 def jpeg(image: NDArray[np.uint8]) -> str:
     """Data URL of a photograph ``(H, W, 3)``."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="jpeg", quality=JPEG_QUALITY)
-    return data_uri(buffer.getvalue(), "image/jpeg")
+    return data_uri(encode_image(image, "jpeg", quality=JPEG_QUALITY), "image/jpeg")
 
 
 def png(image: NDArray[np.uint8]) -> str:
     """Data URL of a drawing ``(H, W, 3)`` with few colours."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).quantize(PNG_COLOURS).save(buffer, format="png", optimize=True)
-    return data_uri(buffer.getvalue(), "image/png")
+    few = Image.fromarray(image).quantize(PNG_COLOURS)
+    return data_uri(encode_image(few, "png", optimize=True), "image/png")
 
 
 def inline(text: str) -> Markup:

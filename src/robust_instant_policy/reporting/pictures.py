@@ -1,4 +1,4 @@
-"""Camera images with keypoints and paths drawn over them, in the values that the template `picture` draws."""
+"""Camera images with keypoints and paths over them, as values for the template `picture`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.geometry import FloatArray, invert_pose, lift, project, transform_points
+from robust_instant_policy.geometry import FloatArray, invert_pose, project, transform_points
 from robust_instant_policy.reporting.pages import jpeg
-from robust_instant_policy.trajectory import Trajectory
 
 REFERENCE_WIDTH = 256  # pixels of an image in which a line of width 1 is one pixel wide
 KEYPOINT_COLOURS = (
@@ -21,7 +20,7 @@ KEYPOINT_COLOURS = (
 
 @dataclass(frozen=True)
 class Mark:
-    """A keypoint at the pixel ``(u, v)``, and where it should be, if that is known."""
+    """A keypoint at the pixel ``(u, v)``, and its true position, if that is known."""
 
     u: float
     v: float
@@ -75,21 +74,6 @@ def keypoint_marks(
             known = (float(truth[index, 0]) + 0.5, float(truth[index, 1]) + 0.5)
         marks.append(Mark(u, v, str(index), keypoint_colour(index), f"keypoint {index}{told}", known))
     return marks
-
-
-def scene_points(observation: Observation, most: int) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """At ``most`` as many points ``(N, 3)``, world, metres, and their colours ``(N, 3)``."""
-    rows, columns = np.nonzero(observation.depth > 0)
-    every = slice(None, None, max(1, -(-len(rows) // most)))
-    rows, columns = rows[every], columns[every]
-    pixels = np.column_stack([columns, rows])
-    points = lift(pixels, observation.depth[rows, columns], observation.intrinsics, observation.camera_pose)
-    return points, observation.rgb[rows, columns]
-
-
-def tool_points(trajectory: Trajectory, arm: int) -> FloatArray:
-    """Midpoints ``(T, 3)`` between the fingertips, in metres."""
-    return trajectory.triplets[:, arm, 1:].mean(axis=1)
 
 
 def svg_points(points: FloatArray, observation: Observation) -> str:

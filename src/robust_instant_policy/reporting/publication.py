@@ -11,7 +11,6 @@ from robust_instant_policy.evaluation.failures import Failure
 from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.evaluation.store import read_results
 from robust_instant_policy.evaluation.suites import CHOSEN
-from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.files import read_regular, write_whole
 from robust_instant_policy.policies import Plan
 from robust_instant_policy.reporting.benchmark import benchmark_figure, benchmark_tables
@@ -73,7 +72,9 @@ def _publish_suite(out: Path, config: str, split: str, summary: Summary, failure
     usual = make_level(suite.level).objects
     kinds = tuple(kind for kind, expected in ((suite.objects, usual), (suite.assets, "code")) if kind != expected)
     if (benchmark := BENCHMARKS.get(suite.name)) is None:
-        figure, shown = draw(summary, _kept_plans(out, summary)), tables(summary)
+        files = {row.trial: out / plan_file(*row.trial) for row in summary.rows if suite.keeps_plans}
+        plans = {trial: Plan.load(path) for trial, path in files.items() if path.exists()}
+        figure, shown = draw(summary, plans), tables(summary)
     else:
         figure, shown = benchmark_figure(benchmark, summary), benchmark_tables(benchmark, summary, failures)
     drawing = encode(figure, "svg")
@@ -88,10 +89,3 @@ def _publish_suite(out: Path, config: str, split: str, summary: Summary, failure
 
 def _text(shown: Sequence[Table]) -> str:
     return "\n".join(table.markdown() for table in shown)
-
-
-def _kept_plans(out: Path, summary: Summary) -> dict[tuple[Scene, Variant], Plan]:
-    if not summary.suite.keeps_plans:
-        return {}
-    files = {row.trial: out / plan_file(*row.trial) for row in summary.rows}
-    return {trial: Plan.load(path) for trial, path in files.items() if path.exists()}

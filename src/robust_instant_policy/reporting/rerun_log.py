@@ -2,7 +2,7 @@
 
 The entities are the same for all: ``world/camera`` with ``rgb`` and ``depth``, ``world/points``, ``world/keypoints``,
 ``world/candidates/Q``, ``world/plan``, ``world/measured``, ``weights/Q``, ``notes``. Steps are the timeline ``step``.
-Needs the extra `rerun`.
+Importing it raises `MissingExtraError` without the extra `rerun`.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import MissingExtraError, RipError, UsageError
+from robust_instant_policy.errors import RipError, UsageError, needs_extra
 from robust_instant_policy.files import PART_SUFFIX, excerpt, make_folder, require_replaceable
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.policy import Plan
-from robust_instant_policy.reporting.pictures import scene_points
 from robust_instant_policy.reporting.run import MEASURED_FILE, PLAN_FILE, SEEN_FILE
 from robust_instant_policy.robots.path import MeasuredPath
 from robust_instant_policy.trajectory import Trajectory
 
-if TYPE_CHECKING:
+with needs_extra("rerun"):
     import rerun as rr
+    import rerun.blueprint as rrb
 
 LIVE = "live"  # in place of a file: a viewer, which is started where none runs
 DEFAULT_PORT = 9876  # of Rerun's viewer
@@ -46,13 +46,8 @@ def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
     """A recording called ``name``: in the file ``where`` (.rrd), shown by a viewer (`LIVE`), or sent to the address of
     one (``rerun+http://…``). It is complete when the block ends; a file takes its name then.
 
-    Raises `UsageError` for anything else, `MissingExtraError` without Rerun, `RipError` where no viewer answers and
-    where the file cannot be written.
+    Raises `UsageError` for anything else, `RipError` where no viewer answers and where the file cannot be written.
     """
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise MissingExtraError("rerun-sdk", "rerun") from error
     recording = rr.RecordingStream("robust-instant-policy")
     try:
         part = _send_to(recording, where)
@@ -62,7 +57,10 @@ def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
         recording.send_recording_name(name)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         yield recording
-        _flush(recording, where)
+        try:
+            recording.flush(timeout_sec=FLUSH_S)
+        except (RuntimeError, ValueError) as error:
+            raise RipError(f"what was logged did not arrive at {where}: {excerpt(error)}; is a viewer there?") from None
         recording.disconnect()
         if part is not None:
             part.replace(where)
@@ -74,8 +72,6 @@ def open_recording(where: str, name: str) -> Iterator[rr.RecordingStream]:
 
 def _send_to(recording: rr.RecordingStream, where: str) -> Path | None:
     """Open ``where`` for the recording; returns the hidden neighbour of a file, to which it is written first."""
-    import rerun as rr
-
     if where.endswith(".rrd"):
         path = Path(where)
         require_replaceable(path)
@@ -95,13 +91,6 @@ def _send_to(recording: rr.RecordingStream, where: str) -> Path | None:
     return None
 
 
-def _flush(recording: rr.RecordingStream, where: str) -> None:
-    try:
-        recording.flush(timeout_sec=FLUSH_S)
-    except (RuntimeError, ValueError) as error:
-        raise RipError(f"what was logged did not arrive at {where}: {excerpt(error)}; is a viewer there?") from None
-
-
 def _require_viewer(address: str) -> None:
     """Raises `RipError` where nothing listens at ``address``: the recording would wait for it."""
     try:
@@ -116,16 +105,13 @@ def log_plan(
 ) -> None:
     """Log what ``plan`` saw and chose and, where it was executed, the way ``measured (N, A, 3)`` of the points between
     the fingertips, metres, world."""
-    import rerun as rr
-
     _log_observation(recording, observation)
     labels = [f"{index + 1}: {confidence:.2f}" for index, confidence in enumerate(plan.keypoint_confidence)]
     recording.log("world/keypoints", rr.Points3D(plan.keypoints, radii=KEYPOINT_M, labels=labels, show_labels=False))
     recording.log("world/camera/rgb/keypoints", rr.Points2D(plan.pixels, radii=4, labels=labels, show_labels=False))
     for index, candidate in enumerate(plan.candidates):
         _log_candidate(recording, index, candidate, plan)
-    _log_path(recording, "world/plan", plan.trajectory, PATH_M)
-    _log_steps(recording, "world/plan/gripper", plan.trajectory)
+    _log_trajectory(recording, plan.trajectory)
     if measured is not None:
         strips = list(np.swapaxes(measured, 0, 1))
         labels = ["measured"] * len(strips)
@@ -149,26 +135,21 @@ def log_run(recording: rr.RecordingStream, folder: Path) -> None:
 
 def log_demonstrations(recording: rr.RecordingStream, demonstrations: Sequence[Demonstration]) -> None:
     """Log every demonstration at its place of the timeline ``demonstration``, with its images where it has some."""
-    import rerun as rr
-
     for index, demonstration in enumerate(demonstrations):
         recording.set_time("demonstration", sequence=index)
         recording.set_time("step", sequence=0)
         _log_observation(recording, demonstration.observation)
-        _log_path(recording, "world/plan", demonstration.trajectory, PATH_M)
         facts = "\n".join(f"- {name}: {value}" for name, value in demonstration.info.items())
         seed = "" if demonstration.seed is None else f", seed {demonstration.seed}"
         text = f"# {demonstration.task} {index}{seed}\n\n{demonstration.seconds:.1f} s\n\n{facts}"
         recording.log("notes", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
-        _log_steps(recording, "world/plan/gripper", demonstration.trajectory)
+        _log_trajectory(recording, demonstration.trajectory)
         for step, image in enumerate(demonstration.frames() if demonstration.frames is not None else ()):
             recording.set_time("step", sequence=step)
             recording.log("world/camera/rgb", rr.Image(image).compress(jpeg_quality=80))
 
 
 def _log_observation(recording: rr.RecordingStream, observation: Observation) -> None:
-    import rerun as rr
-
     height, width = observation.depth.shape
     pose = observation.camera_pose
     recording.log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
@@ -178,25 +159,22 @@ def _log_observation(recording: rr.RecordingStream, observation: Observation) ->
     )
     recording.log("world/camera/rgb", rr.Image(observation.rgb))
     recording.log("world/camera/depth", rr.DepthImage(np.nan_to_num(observation.depth), meter=1.0))
-    points, colours = scene_points(observation, MAX_POINTS)
+    points, colours = observation.points(MAX_POINTS)
     recording.log("world/points", rr.Points3D(points, colors=colours, radii=POINT_M))
 
 
 def _log_candidate(recording: rr.RecordingStream, index: int, candidate: Trajectory, plan: Plan) -> None:
     """A candidate's path, the fainter the lower its weight, and its weight at each step of the plan."""
-    import rerun as rr
-
     is_ignored = bool(plan.hallucinated[index])
     name = f"candidate {index + 1}" + (f", hallucinated from step {plan.onset[index]}" if is_ignored else "")
-    tips = _tips(candidate)
-    pieces = np.stack([tips[:-1], tips[1:]], axis=2).reshape(-1, 2, 3)  # (steps · arms, 2, 3)
-    steps = np.linspace(0, 1, max(len(tips) - 1, 1))
+    pieces = _pieces(candidate)
+    steps = np.linspace(0, 1, max(len(candidate) - 1, 1))
     weights = np.interp(steps, plan.trajectory.times, plan.weights[index]).repeat(candidate.num_arms)
     rgb = np.tile(HALLUCINATED if is_ignored else KEPT, (len(pieces), 1))
     colours = np.column_stack([rgb, 40 + 215 * weights]).astype(np.uint8)
     path = f"world/candidates/{index + 1}"
     recording.log(path, rr.LineStrips3D(pieces, colors=colours, radii=CANDIDATE_M))
-    recording.log(f"{path}/name", rr.Points3D(tips[-1, :1], labels=name, radii=CANDIDATE_M))
+    recording.log(f"{path}/name", rr.Points3D(candidate.tool_points[-1, :1], labels=name, radii=CANDIDATE_M))
     recording.log(f"weights/{index + 1}", rr.SeriesLines(names=name, colors=rgb[:1]), static=True)
     for step, weight in enumerate(plan.weights[index]):
         recording.set_time("step", sequence=step)
@@ -204,35 +182,26 @@ def _log_candidate(recording: rr.RecordingStream, index: int, candidate: Traject
     recording.reset_time()
 
 
-def _log_path(recording: rr.RecordingStream, path: str, trajectory: Trajectory, radius: float) -> None:
-    """The way between the fingertips, in one colour where the gripper is open and in another where it is closed."""
-    import rerun as rr
+def _pieces(trajectory: Trajectory) -> FloatArray:
+    """Segments ``((T - 1)·A, 2, 3)`` of the way between the fingertips, step by step."""
+    tips = trajectory.tool_points
+    return np.stack([tips[:-1], tips[1:]], axis=2).reshape(-1, 2, 3)
 
-    tips = _tips(trajectory)
-    pieces = np.stack([tips[:-1], tips[1:]], axis=2).reshape(-1, 2, 3)
+
+def _log_trajectory(recording: rr.RecordingStream, trajectory: Trajectory) -> None:
+    """The way between the fingertips, in one colour where the gripper is open and in another where it is closed, and
+    the gripper at each step: from one fingertip over the gripper point to the other one."""
+    pieces = _pieces(trajectory)
     closed = trajectory.gripper_state[:-1].ravel() > 0.5
     colours = np.where(closed[:, None], CLOSED, OPEN).astype(np.uint8)
-    recording.log(path, rr.LineStrips3D(pieces, colors=colours, radii=radius))
-
-
-def _log_steps(recording: rr.RecordingStream, path: str, trajectory: Trajectory) -> None:
-    """The gripper at each step: from one fingertip over the gripper point to the other one."""
-    import rerun as rr
-
+    recording.log("world/plan", rr.LineStrips3D(pieces, colors=colours, radii=PATH_M))
     for step, (arms, state) in enumerate(zip(trajectory.triplets, trajectory.gripper_state, strict=True)):
         recording.set_time("step", sequence=step)
-        colours = [CLOSED if closed > 0.5 else OPEN for closed in state]
-        recording.log(path, rr.LineStrips3D(arms[:, [1, 0, 2]], colors=colours, radii=PATH_M))
-
-
-def _tips(trajectory: Trajectory) -> FloatArray:
-    """Points midway between the fingertips ``(T, A, 3)``."""
-    return trajectory.triplets[:, :, 1:].mean(axis=2)
+        shades = [CLOSED if closed > 0.5 else OPEN for closed in state]
+        recording.log("world/plan/gripper", rr.LineStrips3D(arms[:, [1, 0, 2]], colors=shades, radii=PATH_M))
 
 
 def _blueprint() -> Any:
-    import rerun.blueprint as rrb
-
     space = rrb.Spatial3DView(origin="/", contents=["+ /world/**", "- /world/camera/depth"], name="scene and paths")
     image = rrb.Spatial2DView(origin="/world/camera", contents=["+ $origin/**", "- $origin/depth"], name="camera")
     depth = rrb.Spatial2DView(origin="/world/camera", contents=["+ $origin/depth"], name="depth")

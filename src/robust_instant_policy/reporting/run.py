@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,10 +14,11 @@ from plotly.offline import get_plotlyjs
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import open_regular, parse_json, read_regular, write_whole
+from robust_instant_policy.files import load_arrays, npz, parse_json, read_regular, write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.policy import Plan, Stage
 from robust_instant_policy.reporting.charts import (
+    AXIS_COLOURS,
     MM,
     ROBUST_COLOUR,
     candidate_colour,
@@ -31,15 +31,7 @@ from robust_instant_policy.reporting.charts import (
     weights_over_time,
 )
 from robust_instant_policy.reporting.pages import data_uri, render
-from robust_instant_policy.reporting.pictures import (
-    REFERENCE_WIDTH,
-    Line,
-    Picture,
-    keypoint_marks,
-    picture,
-    svg_points,
-    tool_points,
-)
+from robust_instant_policy.reporting.pictures import REFERENCE_WIDTH, Line, Picture, keypoint_marks, picture, svg_points
 from robust_instant_policy.reporting.tables import NONE, Table
 from robust_instant_policy.robots.path import MeasuredPath, Sweep
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
@@ -97,7 +89,7 @@ class RunRecord:
 def save_context(folder: Path, images: Sequence[NDArray[np.uint8]], pixels: FloatArray) -> None:
     """Store the demonstrations' start images and their keypoints' ``pixels (I, K, 2)`` beside the plan."""
     arrays = {f"rgb_{index}": image for index, image in enumerate(images)}
-    np.savez_compressed(folder / CONTEXT_FILE, pixels=pixels, **arrays)  # type: ignore[arg-type]
+    write_whole(folder / CONTEXT_FILE, npz({"pixels": pixels, **arrays}))
 
 
 def write_report(folder: str | Path) -> Path:
@@ -145,16 +137,15 @@ def write_report(folder: str | Path) -> Path:
 
 def _load_context(path: Path) -> list[Picture]:
     """The demonstrations' start images with their keypoints."""
+    advice = "run rip demo again"
+    context = load_arrays(path, ("pixels",), advice)
     try:
-        with open_regular(path) as file, np.load(file, allow_pickle=False) as context:
-            return [
-                picture(context[f"rgb_{index}"], f"demonstration {index}", marks=keypoint_marks(pixels))
-                for index, pixels in enumerate(context["pixels"])
-            ]
-    except FileNotFoundError:
-        raise DatasetError(f"{path} is missing; run rip demo again") from None
-    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        raise DatasetError(f"{path} is damaged ({error}); run rip demo again") from None
+        return [
+            picture(context[f"rgb_{index}"], f"demonstration {index}", marks=keypoint_marks(pixels))
+            for index, pixels in enumerate(context["pixels"])
+        ]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{path} is damaged ({error}); {advice}") from None
 
 
 def _facts(record: RunRecord, plan: Plan) -> dict[str, str]:
@@ -174,7 +165,7 @@ def _candidates_over_scene(observation: Observation, plan: Plan) -> Picture:
 
     def lines(trajectory: Trajectory, colour: str, width: float, dash: str = "", title: str = "") -> list[Line]:
         return [
-            Line(svg_points(tool_points(trajectory, arm), observation), colour, width * unit, dash, title)
+            Line(svg_points(trajectory.tool_points[:, arm], observation), colour, width * unit, dash, title)
             for arm in range(trajectory.num_arms)
         ]
 
@@ -190,7 +181,7 @@ def _frames_over_scene(observation: Observation, plan: Plan) -> Picture:
     unit = observation.rgb.shape[1] / REFERENCE_WIDTH
     drawn = []
     for frame in plan.frames:
-        for axis, colour in enumerate(("#d62728", "#2ca02c", "#1f77b4")):
+        for axis, colour in enumerate(AXIS_COLOURS):
             ends = frame.pose[:3, 3] + np.stack([np.zeros(3), FRAME_AXIS_M * frame.pose[:3, axis]])
             title = f"steps {frame.first} to {frame.last}: {frame.words}"
             drawn.append(Line(svg_points(ends, observation), colour, 2.2 * unit, "", title))
@@ -259,40 +250,22 @@ def _confidence_table(plan: Plan) -> Table:
 def _execution_table(path: MeasuredPath) -> Table:
     """How far the measured path is from the commanded one, for each arm."""
     rows = []
-    for arm in range(path.tool_errors.shape[1]):
-        errors, joints = path.tool_errors[:, arm], np.abs(path.commanded - path.measured)[:, arm, :-1]
-        if len(errors):
-            rows.append(
-                (
-                    str(arm + 1),
-                    f"{len(errors) / path.rate_hz:.1f}",
-                    f"{MM * np.median(errors):.1f}",
-                    f"{MM * errors.max():.1f}",
-                    f"{np.rad2deg(joints.max()):.1f}",
-                )
-            )
+    for arm in range(path.tool_errors.shape[1] if len(path.seconds) else 0):
+        errors, seconds = MM * path.tool_errors[:, arm], len(path.seconds) / path.rate_hz
+        degrees = np.rad2deg(path.joint_errors[:, arm].max())
+        numbers = (seconds, np.median(errors), errors.max(), degrees)
+        rows.append((str(arm + 1), *(f"{number:.1f}" for number in numbers)))
     head = ("arm", "seconds", "tool: median [mm]", "tool: largest [mm]", "joint: largest [degrees]")
     return Table(head, tuple(rows), "")
 
 
 def _stage_table(stages: Sequence[Stage]) -> Table:
-    total = Stage(
-        "total",
-        sum(stage.seconds for stage in stages),
-        sum(stage.prompt_tokens for stage in stages),
-        sum(stage.cached_tokens for stage in stages),
-        sum(stage.completion_tokens for stage in stages),
-    )
-    rows = [
-        (
-            stage.name,
-            f"{stage.seconds:.3f}" if stage.seconds < 1 else f"{stage.seconds:.1f}",
-            *(
-                f"{tokens:,}" if tokens else NONE
-                for tokens in (stage.prompt_tokens, stage.cached_tokens, stage.completion_tokens)
-            ),
-        )
-        for stage in (*stages, total)
-    ]
+    kinds = ("prompt_tokens", "cached_tokens", "completion_tokens")
+    sums = {name: sum(getattr(stage, name) for stage in stages) for name in ("seconds", *kinds)}
+    rows = []
+    for stage in (*stages, Stage("total", **sums)):
+        seconds = f"{stage.seconds:.3f}" if stage.seconds < 1 else f"{stage.seconds:.1f}"
+        counts = [getattr(stage, kind) for kind in kinds]
+        rows.append((stage.name, seconds, *(f"{count:,}" if count else NONE for count in counts)))
     rows[-1] = tuple(f"**{cell}**" for cell in rows[-1])
     return Table(("stage", "seconds", "tokens given", "of these cached", "tokens written"), tuple(rows), "")

@@ -10,14 +10,8 @@ from robust_instant_policy.evaluation import paper
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.failures import STAGES, Failure
 from robust_instant_policy.evaluation.manifest import Invocation
-from robust_instant_policy.evaluation.statistics import (
-    Rate,
-    Summary,
-    mark,
-    mean_and_deviation,
-    reference,
-)
-from robust_instant_policy.evaluation.variant import ROW_METHODS, Variant, by_demos, configs, dof_symbol, labels, values
+from robust_instant_policy.evaluation.statistics import Rate, Summary, mark, mean_and_deviation, reference
+from robust_instant_policy.evaluation.variant import ROW_METHODS, Variant, by_demos, configs, dof_symbol, values
 from robust_instant_policy.reporting.comparison import is_comparable, paper_rate
 
 NONE = "–"
@@ -57,7 +51,7 @@ def success_table(summary: Summary) -> Table:
         of_paper = "paper, physical robot" if task.startswith("aloha") else "paper"
         head += [task, of_paper] if task in compared else [task]
     rows = []
-    for variant, label in zip(summary.variants, labels(summary.variants), strict=True):
+    for variant, label in summary.labels.items():
         row = [label]
         for task in summary.tasks:
             row.append(_cell(summary.rate(variant, task), summary.best(task)))
@@ -71,10 +65,7 @@ def success_table(summary: Summary) -> Table:
         if compared:
             row.append(_paper_average(summary, variant, tried))
         rows.append(tuple(row))
-    counts = ", ".join(
-        f"{label} {_executions(summary, variant)}"
-        for variant, label in zip(summary.variants, labels(summary.variants), strict=True)
-    )
+    counts = ", ".join(f"{label} {_executions(summary, variant)}" for variant, label in summary.labels.items())
     over_same = ", the paper's over the same" if compared else ""
     marked = (
         "RIP is significantly better than those marked \\* or \\*\\* (sign-flip test over scenes, Holm's correction "
@@ -97,13 +88,12 @@ def test_table(summary: Summary) -> Table | None:
     ours = reference(summary.variants)
     if ours is None or len(summary.variants) == 1:
         return None
-    names = dict(zip(summary.variants, labels(summary.variants), strict=True))
     rows = []
     for one in summary.compare(ours):
         low, high = one.interval
         rows.append(
             (
-                names[one.variant],
+                summary.labels[one.variant],
                 f"{100 * one.difference:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})" if one.paired.scenes else NONE,
                 str(one.paired.scenes),
                 str(one.paired.better),
@@ -114,15 +104,8 @@ def test_table(summary: Summary) -> Table | None:
             )
         )
     head = (
-        "rip against",
-        "difference",
-        "shared scenes",
-        "rip better in",
-        "worse in",
-        "paired p",
-        "Holm's p",
-        "t-test p",
-    )
+        "rip against", "difference", "shared scenes", "rip better in", "worse in", "paired p", "Holm's p", "t-test p",
+    )  # fmt: skip
     note = (
         "Difference in percentage points of the averages over the tasks that both methods were tried in, with the same "
         "scenes and sets of demonstrations; in parentheses its 95% interval (cluster bootstrap over scenes). The "
@@ -258,7 +241,7 @@ def _paper_average(summary: Summary, variant: Variant, tasks: Sequence[str]) -> 
 
 
 def _executions(summary: Summary, variant: Variant) -> str:
-    counts = [rate.trials for task in summary.tasks if (rate := summary.rate(variant, task)) is not None]
+    counts = [rate.trials for rate in summary.rates(variant, summary.tasks)]
     return str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
 
 

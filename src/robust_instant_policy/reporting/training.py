@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from robust_instant_policy.evaluation.experiment import training_file
 from robust_instant_policy.evaluation.variant import Variant
 from robust_instant_policy.files import write_whole
+from robust_instant_policy.reporting.figures import encode
 
 if TYPE_CHECKING:  # what it describes needs the extra "train"
     from robust_instant_policy.policies.diffusion.training import TrainedPolicy
@@ -28,8 +29,6 @@ def keep_training_picture(out: Path, task: str, variant: Variant, policy: Traine
 
 def training_picture(policy: TrainedPolicy) -> bytes:
     """SVG: the loss over the steps, and the first arm's gripper point in some demonstrations, shown and sampled."""
-    from matplotlib.figure import Figure
-
     losses, rehearsals = policy.trained_.losses, policy.rehearse(SAMPLED_DEMONSTRATIONS)
     figure = Figure(figsize=(4 + 3 * len(rehearsals), 3), layout="constrained")
     curve, *axes = figure.subplots(1, 1 + len(rehearsals), width_ratios=[1.3] + [1] * len(rehearsals))
@@ -48,6 +47,4 @@ def training_picture(policy: TrainedPolicy) -> bytes:
     figure.legend(
         *axes[0].get_legend_handles_labels(), loc="outside right upper", title="solid: shown\ndashed: sampled"
     )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg")
-    return buffer.getvalue()
+    return encode(figure, "svg")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.robots.device import Device
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +24,11 @@ class Frame:
     intrinsics: FloatArray
     timestamp: float
 
+    @property
+    def depth_share(self) -> float:
+        """Share of the pixels that have depth."""
+        return float((np.isfinite(self.depth) & (self.depth > 0)).mean())
+
 
 def check_alive(camera: str, rgb: NDArray[np.uint8], before: NDArray[np.uint8] | None) -> None:
     """Raises `RobotError` for an image that repeats the one ``before``: noise makes any two images differ."""
@@ -30,20 +36,12 @@ def check_alive(camera: str, rgb: NDArray[np.uint8], before: NDArray[np.uint8] |
         raise RobotError(f"{camera} repeats the same image: it is frozen; unplug it and connect it again")
 
 
-class Camera(Protocol):
-    """An RGB-D camera. The methods raise `RobotError` when the device does not answer."""
-
-    name: str
-
-    def connect(self) -> None:
-        """Open the device and wait until exposure and depth are stable."""
-        ...
+class Camera(Device, Protocol):
+    """An RGB-D camera; `connect` waits until exposure and depth are stable."""
 
     def read(self) -> Frame:
         """The next frame, taken after the call."""
         ...
-
-    def disconnect(self) -> None: ...
 
 
 class VideoCamera(Camera, Protocol):

@@ -46,7 +46,7 @@ FIRST_RUN_SPEED = 0.25  # share of the usual speed, until a first run in a cell 
 
 
 class Section:
-    """A table of a TOML file whose keys are taken one by one; errors name the file, the key and what it should be."""
+    """A table of a TOML file. Its keys are read one by one; errors name the file, the key and the expected value."""
 
     def __init__(self, values: Mapping[str, Any], where: str):
         self._values, self._where = dict(values), where
@@ -120,8 +120,8 @@ class Section:
             raise self.error(key, "must reach above the table, whose z is 0")
         return box
 
-    def section(self, key: str, default: Mapping[str, Any] | None = None) -> Section:
-        value = self._take(key, default)
+    def section(self, key: str) -> Section:
+        value = self._take(key, None)
         if not isinstance(value, Mapping):
             raise self.error(key, f"must be a table, not {value!r}")
         return Section(value, f"{self._where}: {key}")
@@ -133,12 +133,12 @@ class Section:
         return [Section(one, f"{self._where}: {key}[{index}]") for index, one in enumerate(value)]
 
     def rest(self) -> Mapping[str, Any]:
-        """What was not taken yet, for a driver that reads it as a `Section` of its own."""
+        """The keys that were not read yet, for a driver."""
         values, self._values = self._values, {}
         return MappingProxyType(values)
 
     def finish(self) -> None:
-        """Raises `CellError` for a key that nobody took: a misspelt one would be ignored."""
+        """Raises `CellError` for a key that was not read: it is misspelt."""
         for key in self._values:
             raise self.error(key, "is not known here; is it misspelt?")
 
@@ -300,21 +300,12 @@ def read_camera_pose(path: Path) -> FloatArray:
     return pose
 
 
-def read_gripper(path: Path) -> GripperTriangle:
-    """``length`` and ``opening``, metres, of a gripper's file; other keys are the calibration's own."""
-    return _gripper(read_section(path))
-
-
-def read_tool(path: Path) -> FloatArray | None:
-    """``tool (4, 4)`` of a gripper's file, measured tool -> tool of the arm's model; None without it."""
+def read_gripper(path: Path) -> tuple[GripperTriangle, FloatArray | None]:
+    """``length`` and ``opening``, metres, of a gripper's file, and its ``tool (4, 4)``, measured tool -> tool of the
+    arm's model, None without it; other keys are the calibration's own."""
     section = read_section(path)
-    return section.pose("tool") if "tool" in section else None
-
-
-def _gripper(section: Section) -> GripperTriangle:
-    return GripperTriangle(
-        section.number("length", least=0.002, most=1.0), section.number("opening", least=0.002, most=0.5)
-    )
+    length, opening = (section.number(key, least=0.002, most=most) for key, most in (("length", 1.0), ("opening", 0.5)))
+    return GripperTriangle(length, opening), section.pose("tool") if "tool" in section else None
 
 
 def _limits(cell: Section) -> Limits:
@@ -330,7 +321,7 @@ def _limits(cell: Section) -> Limits:
 
 
 def _name(section: Section, default: str | None = None) -> str:
-    """A name that may stand in a file's name and in an address."""
+    """A name that is valid in file names and addresses."""
     name = section.text("name", default)
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise section.error("name", f"must be letters, digits, _, . and -, not {name!r}")
@@ -363,7 +354,7 @@ def _arm(section: Section, path: Path) -> ArmConfig:
                 "take the key out until rip calibrate tool has written it; an arm of your own needs length and opening"
             )
             raise section.error("gripper", f"is wrong, there is no file at {file}: {words}, metres, by a ruler first")
-        gripper, tool = read_gripper(file), read_tool(file)
+        gripper, tool = read_gripper(file)
     config = ArmConfig(
         name=name,
         model=section.text("model"),

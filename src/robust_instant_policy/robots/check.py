@@ -18,6 +18,7 @@ from robust_instant_policy.robots.calibration import check_camera
 from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cameras import make_camera
 from robust_instant_policy.robots.cell import ArmConfig, CellConfig
+from robust_instant_policy.robots.device import connected
 from robust_instant_policy.robots.execution import MIN_DEPTH_SHARE
 from robust_instant_policy.robots.follower import Follower
 from robust_instant_policy.robots.leaders import make_leader
@@ -58,11 +59,8 @@ def _park_poses(station: Station) -> list[tuple[str, bool]]:
 
 
 def _arm(arm: Arm, follower: Follower, rate_hz: float) -> list[tuple[str, bool]]:
-    follower.connect()
-    try:
+    with connected(follower):
         states, at, seconds = _readings(follower.state, rate_hz)
-    finally:
-        follower.disconnect()
     clocks = [state.clock for state in states]
     return [
         _timing(f"{arm.name}: 95% of the states", seconds, rate_hz),
@@ -78,12 +76,9 @@ def _arm(arm: Arm, follower: Follower, rate_hz: float) -> list[tuple[str, bool]]
 def _leader(config: ArmConfig, arm: Arm, cell: CellConfig) -> list[tuple[str, bool]]:
     leader = make_leader(config, arm, cell.rate_hz, cell.path.parent, lambda keys: "")
     parked = ArmState(arm.home, np.zeros_like(arm.home), arm.finger_travel, 0.0, 0.0)
-    leader.connect()
-    try:
+    with connected(leader):
         leader.start()
         _, _, seconds = _readings(lambda: leader.read(parked), cell.rate_hz)
-    finally:
-        leader.disconnect()
     return [_timing(f"{leader.name}: 95% of the readings", seconds, cell.rate_hz)]
 
 
@@ -121,17 +116,12 @@ def _at_park(name: str, joints: FloatArray, home: FloatArray) -> tuple[str, bool
 def _camera(config: CellConfig) -> list[tuple[str, bool]]:
     if config.camera is None:
         return [("camera: the cell's file has no table [camera]", False)]
-    camera = make_camera(config.camera, config.path.parent)
-    camera.connect()
-    try:
+    with connected(make_camera(config.camera, config.path.parent)) as camera:
         start = time.monotonic()
         frames = [camera.read() for _ in range(FRAMES)]
         rate = FRAMES / (time.monotonic() - start)
-    finally:
-        camera.disconnect()
-    depth = frames[-1].depth
-    share = float((np.isfinite(depth) & (depth > 0)).mean())
-    height, width = depth.shape
+    share = frames[-1].depth_share
+    height, width = frames[-1].depth.shape
     return [
         (f"camera {camera.name}: {width} x {height} at {rate:.0f} frames/s", True),
         (

@@ -15,14 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from robust_instant_policy.errors import MissingExtraError, RobotError
+from robust_instant_policy.errors import RobotError, needs_extra
 from robust_instant_policy.geometry import FloatArray
 
-try:
+with needs_extra("robots"):
     import dynamixel_sdk as sdk
     import serial
-except ModuleNotFoundError as error:
-    raise MissingExtraError(error.name or "dynamixel-sdk", "robots") from error
 
 TIMEOUT_MS = 30.0  # of a transaction; a USB adapter with its latency timer of 16 ms needs about 20
 RETRY_TIMEOUTS = 2.1  # after so many of them no new try begins: the last one ends within 100 ms
@@ -56,8 +54,6 @@ TICK = Register(120, 2)  # milliseconds, wraps at 32768
 PRESENT_CURRENT = Register(126, 2, signed=True)
 PRESENT_VELOCITY = Register(128, 4, signed=True)
 PRESENT_POSITION = Register(132, 4, signed=True)
-TEMPERATURE = Register(146, 1)
-VOLTAGE = Register(144, 2)  # 0.1 V
 
 POSITION_MODE, CURRENT_POSITION_MODE = 3, 5
 TICK_TURN = 32768

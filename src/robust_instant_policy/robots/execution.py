@@ -1,4 +1,4 @@
-"""What stands between a camera, a plan and a motion of real arms: the checks that refuse."""
+"""Checks between a camera image, a plan and a motion of real arms, and the motions before a plan."""
 
 from __future__ import annotations
 
@@ -37,11 +37,10 @@ def observe(config: CellConfig, camera: Camera) -> Observation:
         raise RobotError(f"camera {camera.name} repeats its image: it is frozen; unplug it, plug it in, and run again")
     if config.camera_calibration is not None:
         check_camera(config.camera_calibration, camera.name, frame)
-    share = float((np.isfinite(frame.depth) & (frame.depth > 0)).mean())
-    if share < MIN_DEPTH_SHARE:
+    if frame.depth_share < MIN_DEPTH_SHARE:
         raise RobotError(
-            f"camera {camera.name}: {100 * share:.0f}% of the pixels have depth, at least {100 * MIN_DEPTH_SHARE:.0f}% "
-            "are needed; uncover it, or move it farther away"
+            f"camera {camera.name}: {100 * frame.depth_share:.0f}% of the pixels have depth, at least "
+            f"{100 * MIN_DEPTH_SHARE:.0f}% are needed; uncover it, or move it farther away"
         )
     return Observation(frame.rgb, frame.depth, frame.intrinsics, config.camera_pose)
 
@@ -64,7 +63,7 @@ def require_trust(config: CellConfig, confidence: float | None, cell: str) -> No
 
 
 def is_parked(station: Station) -> bool:
-    """Whether all arms are where a plan begins."""
+    """Whether all arms are at their park poses, where a plan begins."""
     states = station.states()
     away = [np.abs(state.joints - arm.home).max() for state, arm in zip(states, station.arms, strict=True)]
     return max(away) <= START_RAD
@@ -76,7 +75,7 @@ def has_open_grippers(station: Station) -> bool:
 
 
 def open_grippers(station: Station, stop: StopRequest) -> None:
-    """Open all grippers, whatever they hold; arms keep their joints."""
+    """Open all grippers, also those that hold something; joints do not move."""
     steps = count(1)
     seconds = max(OPENING_S, *(OPENING_MARGIN * arm.finger_travel / arm.finger_speed for arm in station.arms))
 

@@ -5,18 +5,15 @@ from __future__ import annotations
 from typing import Protocol
 
 from robust_instant_policy.motion.state import ArmState, Command
+from robust_instant_policy.robots.device import Device
 
-__all__ = ["ArmState", "Command", "Follower"]
 
-
-class Follower(Protocol):
+class Follower(Device, Protocol):
     """An arm with a gripper that follows joint commands.
 
     The methods raise `RobotError` within 100 ms when the device does not answer. Tool poses become joint commands
     through `motion.kinematics`; see `robots.models.arm_of`.
     """
-
-    name: str
 
     def connect(self) -> None:
         """Open the device, check that it is the configured one, and hold the present position. Nothing moves."""
@@ -27,7 +24,7 @@ class Follower(Protocol):
         ...
 
     def command(self, command: Command) -> None:
-        """Go on to ``command``, one control step ahead. Returns without waiting for the motion."""
+        """Move to ``command``, one control step ahead. Returns without waiting for the motion."""
         ...
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""The episode under way, on disk while it is recorded: a process that dies loses none of its steps.
+"""The current episode on disk while it is recorded: no step is lost if the process dies.
 
 A hidden folder beside the dataset holds ``start.npz`` (the observation), ``facts.json`` and ``steps.f64``, to which
 each step is appended at once.
@@ -25,7 +25,7 @@ START, FACTS, STEPS = "start.npz", "facts.json", "steps.f64"
 @dataclass(frozen=True, eq=False)
 class Episode:
     """``steps (T, A, 2, J + 1)``: for each arm the commanded and the measured joints, rad, and finger travel, metres;
-    ``seconds (T,)`` of a clock that does not jump; ``calibration`` is the cell's digest."""
+    ``seconds (T,)`` of `time.monotonic`; ``calibration`` is the cell's digest."""
 
     start: Observation
     steps: FloatArray

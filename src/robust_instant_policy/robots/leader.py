@@ -4,26 +4,21 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from robust_instant_policy.robots.follower import ArmState, Command
+from robust_instant_policy.motion.state import ArmState, Command
+from robust_instant_policy.robots.device import Device
 
 
-class Leader(Protocol):
-    """Commands one follower. The methods raise `RobotError` when the device does not answer."""
-
-    name: str
-
-    def connect(self) -> None: ...
+class Leader(Device, Protocol):
+    """Commands one follower."""
 
     def start(self) -> None:
-        """Called before leading begins: where the leader was before does not matter."""
+        """Called before leading begins: forget earlier readings."""
         ...
 
     def read(self, follower: ArmState) -> Command:
         """The command for the follower now.
 
-        A leader arm returns its own joints; a keyboard or gamepad moves on from its last command, at first from
+        A leader arm returns its own joints; a keyboard or gamepad continues from its last command, the first time from
         the state of the ``follower``.
         """
         ...
-
-    def disconnect(self) -> None: ...

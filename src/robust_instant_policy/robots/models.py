@@ -1,4 +1,4 @@
-"""Models of known arms: kinematics from a URDF, gripper and limits from the makers' figures."""
+"""Models of known arms: kinematics from a URDF, gripper and limits from data sheets."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from robust_instant_policy import motion
 from robust_instant_policy.errors import CellError
@@ -134,9 +135,5 @@ def _check_known(config: ArmConfig, model: ArmModel) -> None:
 
 def _move_tool(link: mujoco.MjsBody, tool: FloatArray) -> None:
     """Correct the tool's link by ``tool (4, 4)``, measured -> model's."""
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, link.quat)
-    pose = make_pose(turn.reshape(3, 3), link.pos) @ tool
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, pose[:3, :3].ravel())
-    link.pos, link.quat = pose[:3, 3], quaternion
+    pose = make_pose(Rotation.from_quat(np.asarray(link.quat)[[1, 2, 3, 0]]).as_matrix(), link.pos) @ tool
+    link.pos, link.quat = pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]

@@ -9,7 +9,6 @@ import termios
 import time
 import tty
 from collections.abc import Callable
-from types import TracebackType
 from typing import Protocol
 
 from robust_instant_policy.robots.signals import StopRequest
@@ -53,9 +52,7 @@ class Terminal:
             tty.setcbreak(self._input)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._settings is not None:
             termios.tcsetattr(self._input, termios.TCSADRAIN, self._settings)
 

@@ -1,17 +1,14 @@
-"""What a motion will sweep, what was commanded and measured, and what a gripper's width and force say about a grasp."""
+"""Space that a motion will sweep; commanded and measured paths; detection of empty grasps from width and force."""
 
 from __future__ import annotations
 
-import io
-import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.files import open_regular, write_whole
+from robust_instant_policy.files import load_arrays, npz, write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm, Motion
 from robust_instant_policy.motion.capsules import ArmShape
@@ -23,14 +20,14 @@ CLOSED_M = 1e-6
 
 SWEPT_MOMENTS = 24  # of a motion, at which its arms are drawn
 
+ADVICE = "execute the plan again"
 ARRAYS = ("rate_hz", "commanded", "measured", "commanded_tools", "measured_tools", "loads", "seconds")
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """What a motion will sweep, metres in the world: the points between the fingertips ``tools (N, A, 3)`` at each
-    step, and at some ``seconds (S,)`` the middle lines ``links (S, C, 2, 3)`` of the capsules around the arms' links.
-    """
+    """Space that a motion sweeps, metres, world: points between the fingertips ``tools (N, A, 3)`` at each step, and at
+    some ``seconds (S,)`` the axes ``links (S, C, 2, 3)`` of the capsules around the arms' links."""
 
     tools: FloatArray
     links: FloatArray
@@ -44,33 +41,18 @@ class Sweep:
         return cls(tool_points(motion.joints, arms), np.concatenate(links, axis=1), rows / rate_hz)
 
     def save(self, path: Path) -> None:
-        _save(path, {"tools": self.tools, "links": self.links, "seconds": self.seconds})
+        write_whole(path, npz(vars(self)))
 
     @classmethod
     def load(cls, path: Path) -> Sweep:
         """Raises `DatasetError` for a file that is not the sweep of a motion."""
-        return cls(**_load(path, ("tools", "links", "seconds")))
+        return cls(**load_arrays(path, ("tools", "links", "seconds"), ADVICE))
 
 
 def tool_points(joints: FloatArray, arms: Sequence[Arm]) -> FloatArray:
     """Points between the fingertips ``(N, A, 3)``, metres in the world, at ``joints (N, A, J)``."""
     points = [[arm.kinematics.tool_pose(row[i])[:3, 3] for i, arm in enumerate(arms)] for row in joints]
     return np.array(points).reshape(len(joints), len(arms), 3)
-
-
-def _save(path: Path, arrays: Mapping[str, object]) -> None:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    write_whole(path, buffer.getvalue())
-
-
-def _load(path: Path, names: Sequence[str]) -> dict[str, FloatArray]:
-    """The arrays of a file that `_save` wrote. Raises `DatasetError` for another one."""
-    try:
-        with open_regular(path) as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in names}
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise DatasetError(f"{path} cannot be read: {error}; execute the plan again") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,28 +70,23 @@ class MeasuredPath:
     seconds: FloatArray
 
     def save(self, path: Path) -> None:
-        _save(path, {name: getattr(self, name) for name in ARRAYS})
+        write_whole(path, npz(vars(self)))
 
     @classmethod
     def load(cls, path: Path) -> MeasuredPath:
         """Raises `DatasetError` for a file that is not a measured path."""
-        arrays = _load(path, ARRAYS)
+        arrays = load_arrays(path, ARRAYS, ADVICE)
         return cls(float(arrays.pop("rate_hz")), **arrays)
 
     @property
-    def worst_following_error(self) -> float:
-        """Largest difference, rad, between a commanded and a measured joint."""
-        return float(np.abs(self.commanded - self.measured)[..., :-1].max(initial=0.0))
+    def joint_errors(self) -> FloatArray:
+        """Differences ``(N, A, J)``, rad, between commanded and measured joints."""
+        return np.abs(self.commanded - self.measured)[..., :-1]
 
     @property
     def tool_errors(self) -> FloatArray:
         """Distances ``(N, A)``, metres, between commanded and measured tools."""
         return np.linalg.norm(self.commanded_tools - self.measured_tools, axis=-1)
-
-    @property
-    def jitter(self) -> FloatArray:
-        """Deviation ``(N - 1,)``, seconds, of the time between two commands from that of the rate."""
-        return np.abs(np.diff(self.seconds) - 1 / self.rate_hz)
 
     def empty_grasps(self, names: Sequence[str]) -> list[str]:
         """One line for each time that a gripper closed and held nothing."""

@@ -5,7 +5,7 @@ leaders ─read─▶ soft start ─▶ wanted ─▶ `Station.lead` (gate, foll
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -20,28 +20,37 @@ from robust_instant_policy.robots.operator import ENTER, Operator
 from robust_instant_policy.robots.station import Station
 from robust_instant_policy.trajectory import Trajectory
 
-APPROACH_RAD_S = 0.5  # at which a follower comes to its leader before both are coupled
+APPROACH_RAD_S = 0.5  # speed of a follower towards its leader before both are coupled
 WAIT_S = 1.5  # without progress, until the person is told
 PROGRESS_RAD = 1e-4  # in a step
-COUPLED_RAD = 0.05  # of each joint between leader and follower, from which they are coupled
+COUPLED_RAD = 0.05  # difference of each joint, below which leader and follower are coupled
 TRIGGER_CLOSES, TRIGGER_OPENS = 0.4, 0.6  # opening of the trigger; between them the gripper keeps its state
 STILL_M = 0.003  # by which gripper points move at most while nothing is shown
 STILL_KEPT_S = 0.1  # of rest that stays before the first and after the last motion
 MIN_STEPS = 10  # of a demonstration
 
 DISCARD, QUIT = "d", "q"
+OnStep = Callable[[Sequence[Command], Sequence[float], Sequence[ArmState]], None]
 
 
 class Following:
-    """What `Station.lead` asks in each step: where the followers shall go, from the leaders. An arm whose leader is
-    None holds.
+    """Commands for each step of `Station.lead`, from the leaders; an arm whose leader is None holds.
 
-    ``key`` is the key that ended it, "" where a stop was requested. Grippers open and close completely, as they will
-    when a plan is executed.
+    ``key`` is the key that ended it, "" after a request to stop. Grippers open and close completely, as in the
+    execution of a plan. While leaders and followers are coupled, ``on_step`` is called in each step with the last
+    commands, the travel of each gripper (open or closed), and the states after them.
     """
 
-    def __init__(self, station: Station, leaders: Sequence[Leader | None], operator: Operator, coupled: str):
+    def __init__(
+        self,
+        station: Station,
+        leaders: Sequence[Leader | None],
+        operator: Operator,
+        coupled: str,
+        on_step: OnStep = lambda *_: None,
+    ):
         self._station, self._leaders, self._operator, self._words = station, leaders, operator, coupled
+        self._on_step = on_step
         self._travels: list[float] = []  # of each gripper, open or closed, from the first step on
         self._coupled, self._waited, self._gap = False, 0, np.inf
         self.key = ""
@@ -63,15 +72,12 @@ class Following:
                 most if told.finger_travel > most / 2 else 0.0 for told, most in zip(last, full, strict=True)
             ]
         if self._coupled:
-            self._on_step(last, states)
+            self._on_step(last, self._travels, states)
         wanted = [
             told if leader is None else self._whole(arm, leader.read(state))
             for arm, (leader, state, told) in enumerate(zip(self._leaders, states, last, strict=True))
         ]
         return wanted if self._coupled else self._approach(last, wanted)
-
-    def _on_step(self, last: Sequence[Command], states: Sequence[ArmState]) -> None:
-        """Called with the last commands and the states after them, while leaders and followers are coupled."""
 
     def _whole(self, arm: int, told: Command) -> Command:
         """``told`` with the gripper open or closed."""
@@ -98,30 +104,6 @@ class Following:
         return [Command(told.joints + np.clip(gap, -most, most), told.finger_travel) for told, gap in pairs]
 
 
-class _Teaching(Following):
-    """`Following` that keeps ``steps`` and ``seconds``, those of `Episode`."""
-
-    def __init__(self, station: Station, leaders: Sequence[Leader | None], operator: Operator, journal: Journal):
-        super().__init__(station, leaders, operator, "coupled, recording: Enter ends the demonstration, d discards it")
-        self._journal, self._logging = journal, True
-        self.steps: list[FloatArray] = []
-        self.seconds: list[float] = []
-
-    def _on_step(self, last: Sequence[Command], states: Sequence[ArmState]) -> None:
-        pairs = zip(last, self._travels, states, strict=True)
-        step = np.array(
-            [[[*told.joints, travel], [*state.joints, state.finger_travel]] for told, travel, state in pairs]
-        )
-        self.steps.append(step)
-        self.seconds.append(self._station.sent_at)
-        if self._logging:
-            try:
-                self._journal.add(self.seconds[-1], step)
-            except OSError as error:  # the arms move: the disk can wait
-                self._logging = False
-                self._operator.say(f"the journal cannot be written ({error.strerror}); recording goes on in memory")
-
-
 def teach(
     station: Station, leaders: Sequence[Leader], start: Observation, journal: Journal, operator: Operator
 ) -> tuple[Episode, str]:
@@ -129,15 +111,31 @@ def teach(
 
     Raises `RobotError` where a device fails; the journal then holds the episode.
     """
-    digest = station.config.digest
-    journal.begin(start, digest, (len(station.arms), 2, len(station.arms[0].home) + 1))
-    teaching = _Teaching(station, leaders, operator, journal)
+    digest, shape = station.config.digest, (len(station.arms), 2, len(station.arms[0].home) + 1)
+    steps: list[FloatArray] = []
+    seconds: list[float] = []
+    in_memory = False
+
+    def keep(last: Sequence[Command], travels: Sequence[float], states: Sequence[ArmState]) -> None:
+        nonlocal in_memory
+        triples = zip(last, travels, states, strict=True)
+        steps.append(np.array([[[*a.joints, travel], [*b.joints, b.finger_travel]] for a, travel, b in triples]))
+        seconds.append(station.sent_at)
+        if not in_memory:
+            try:
+                journal.add(seconds[-1], steps[-1])
+            except OSError as error:  # the arms move: the disk can wait
+                in_memory = True
+                operator.say(f"the journal cannot be written ({error.strerror}); recording goes on in memory")
+
+    journal.begin(start, digest, shape)
+    words = "coupled, recording: Enter ends the demonstration, d discards it"
+    following = Following(station, leaders, operator, words, keep)
     try:
-        station.lead(teaching)
+        station.lead(following)
     finally:
         journal.end()
-    steps = np.array(teaching.steps).reshape(-1, len(station.arms), 2, len(station.arms[0].home) + 1)
-    return Episode(start, steps, np.array(teaching.seconds), digest), teaching.key
+    return Episode(start, np.array(steps).reshape(-1, *shape), np.array(seconds), digest), following.key
 
 
 def guide(station: Station, leaders: Sequence[Leader | None], operator: Operator, words: str) -> str:
@@ -147,9 +145,9 @@ def guide(station: Station, leaders: Sequence[Leader | None], operator: Operator
     return following.key
 
 
-def jitter(episode: Episode, rate_hz: float) -> FloatArray:
-    """Deviation ``(T - 1,)``, seconds, of the time between two steps from that of the rate."""
-    return np.abs(np.diff(episode.seconds) - 1 / rate_hz)
+def jitter_95_ms(seconds: FloatArray, rate_hz: float) -> float:
+    """95th percentile, milliseconds, of the deviation of steps at ``seconds (T,)`` from the period of the rate."""
+    return 1e3 * float(np.percentile(np.abs(np.diff(seconds) - 1 / rate_hz), 95))
 
 
 def demonstration_of(
@@ -172,7 +170,7 @@ def demonstration_of(
     facts: dict[str, str | float | int] = {
         "cell": cell,
         "calibration": episode.calibration,
-        "jitter_95_ms": round(1e3 * float(np.percentile(jitter(episode, rate_hz), 95)), 2),
+        "jitter_95_ms": round(jitter_95_ms(episode.seconds, rate_hz), 2),
     }
     return Demonstration(episode.start, trajectory, rate_hz, task, seed, facts)
 

@@ -1,13 +1,13 @@
 """The process that talks to a UR controller through `ur_rtde`, and to a Robotiq gripper on its own port.
 
-The library ends its whole process when a connection breaks at a bad moment (an exception leaves one of its threads),
-and may wait for minutes on one that is dead. So it runs in a process of its own, which the follower can end:
+If a connection breaks, the library may end the whole process (an exception leaves one of its threads) or block for
+minutes. So it runs in a process of its own, which the follower can end:
 
 followers.ur ── [number, request, arguments] ──▶ this process ── RTDE, dashboard, text lines ──▶ controller, gripper
              ◀── [number, result, error] ───────
 
-Messages are JSON. Where the pipe ends, the process that commands the arm has ended: the arm is stopped. Where this
-process ends, the controller's own watchdog stops the arm.
+Messages are JSON. If the pipe closes, the process that commands the arm has ended: the arm is stopped. If this process
+ends, the controller's own watchdog stops the arm.
 """
 
 from __future__ import annotations

@@ -8,11 +8,11 @@ from __future__ import annotations
 import os
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
-from robust_instant_policy.demonstration import Demonstration, Observation
+from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import DatasetError, StoppedError, UnreachableError
 from robust_instant_policy.files import read_regular, write_whole
 from robust_instant_policy.robots.camera import Camera
@@ -31,7 +31,7 @@ LATE_S = 5e-3  # deviation of a step that 95% of the steps must keep within
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What is needed to record demonstrations of a task; all devices are connected.
+    """Records demonstrations of a task; all devices are connected.
 
     ``writer`` is of the folder; ``show(observation)`` shows a start image and the keypoints found in it;
     ``next_scene()`` prepares an emulated scene and returns its seed, None where a person arranges it.
@@ -92,9 +92,10 @@ class Session:
 
     def _store(self, episode: Episode, journal: Journal, seed: int | None) -> None:
         """Add the episode if the person wants it, and say at once what `rip check` finds."""
-        operator, station = self.operator, self.station
+        operator, station, config = self.operator, self.station, self.station.config
+        paced = replace(episode, seconds=episode.seconds * config.pace)
         try:
-            demonstration = self._demonstration(episode, seed)
+            demonstration = demonstration_of(paced, station.arms, config.rate_hz, self.writer.task, config.name, seed)
         except DatasetError as error:
             operator.say(f"  {error}")
             self._discard(journal, seed)
@@ -121,13 +122,7 @@ class Session:
         for finding in findings:
             operator.say(f"    {finding}")
         if not findings:
-            operator.say(f"    checked against the other demonstrations of {station.config.name}: no problem found")
-
-    def _demonstration(self, episode: Episode, seed: int | None) -> Demonstration:
-        config = self.station.config
-        rate = config.rate_hz
-        paced = Episode(episode.start, episode.steps, episode.seconds * config.pace, episode.calibration)
-        return demonstration_of(paced, self.station.arms, rate, self.writer.task, config.name, seed)
+            operator.say(f"    checked against the other demonstrations of {config.name}: no problem found")
 
     def _discard(self, journal: Journal, seed: int | None) -> None:
         journal.discard()

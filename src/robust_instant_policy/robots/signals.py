@@ -1,4 +1,4 @@
-"""Ctrl-C, a terminal that closes and a polite kill become a request to stop, which the control loop obeys."""
+"""Ctrl-C, SIGTERM and a closed terminal become a request to stop, which the control loop checks in each step."""
 
 from __future__ import annotations
 

@@ -13,7 +13,6 @@ import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from robust_instant_policy.motion.gate import STALE_S, Gate
 from robust_instant_policy.motion.guard import minimum_jerk
 from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.cell import CellConfig
+from robust_instant_policy.robots.device import connected
 from robust_instant_policy.robots.follower import Follower
 from robust_instant_policy.robots.followers import make_follower
 from robust_instant_policy.robots.models import arm_of
@@ -34,6 +34,7 @@ from robust_instant_policy.robots.signals import StopRequest
 BRAKING_S = 0.24  # time in which a motion is brought to rest on request
 BLENDING_S = 0.5  # time in which the difference between measured joints and the motion's first ones fades out
 START_RAD = 0.1  # largest such difference
+Step = tuple[float, Sequence[Command], Sequence[ArmState]]  # time, what was sent, and the states after it
 HOLDING = "the arms hold their position"
 EMULATED_STALE_S = 0.5, 0.2  # greatest age of a state, at pace 1 and at any pace: an emulation shares the processor
 
@@ -56,24 +57,6 @@ class Played:
             raise StoppedError(f"{self.stopped}; {known}")
 
 
-class Ticker:
-    """Absolute deadlines at a rate, on a clock that a change of the system's time does not touch."""
-
-    def __init__(self, rate_hz: float):
-        self._period = 1 / rate_hz
-        self._next = time.monotonic()
-
-    def wait(self) -> float:
-        """Sleep until the next deadline and return the time, seconds. A missed deadline is not caught up with."""
-        self._next += self._period
-        now = time.monotonic()
-        if self._next > now:
-            time.sleep(self._next - now)
-            return time.monotonic()
-        self._next = now
-        return now
-
-
 class Station:
     """The arms of a cell; a context manager that connects them, and at its end stops and disconnects them."""
 
@@ -88,20 +71,17 @@ class Station:
             raise CellError(f"{config.path}: the arms of a cell must have as many joints as each other, not {counts}")
         most, least = EMULATED_STALE_S
         stale_s = STALE_S if config.emulation is None else max(most / config.pace, least)
-        self.sent_at = 0.0  # of the last command, seconds of a clock that does not jump
+        self.sent_at = 0.0  # of the last command, seconds of `time.monotonic`
         self.gate = Gate(self.arms, config.limits, config.rate_hz, stale_s)
 
     def __enter__(self) -> Station:
         with contextlib.ExitStack() as stack:
             for follower in self.followers:
-                follower.connect()
-                stack.callback(follower.disconnect)
+                stack.enter_context(connected(follower))
             self._connected = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._connected:
             self.stop()
 
@@ -121,7 +101,7 @@ class Station:
         A request to ``stop`` brakes the motion on its path; anything that is wrong stops the arms at once.
         """
         braking, blending = (max(round(seconds * self.rate_hz), 1) for seconds in (BRAKING_S, BLENDING_S))
-        log = _Log(len(motion.joints) + braking, motion.joints.shape[1:])
+        steps: list[Step] = []
         last = len(motion.joints) - 1
         most = np.array([arm.finger_speed for arm in self.arms]) / self.rate_hz
         position, stride, step, offset = -1.0, 1.0, 0, np.zeros(motion.joints.shape[1:])
@@ -143,15 +123,15 @@ class Station:
 
         stopped, holds = "", True
         try:
-            self._loop(command, self.gate.admit, log)
+            self._loop(command, self.gate.admit, steps.append)
         except (RobotError, UnreachableError) as error:
             stopped, holds = str(error), isinstance(error, StoppedError | UnreachableError)
-        path = log.path(self.rate_hz, self.arms)
+        path = _path_of(steps, self.rate_hz, self.arms)
         return Played(path, stopped or stop.reason, holds)  # a request may have come after the last command
 
     def lead(self, command: Callable[[Sequence[ArmState]], Sequence[Command] | None]) -> None:
         """Let the arms follow ``command(states)``, slowed down by `Gate.limited`, until it returns None."""
-        self._loop(command, self.gate.limited, None)
+        self._loop(command, self.gate.limited, lambda _: None)
 
     def _start_offset(self, motion: Motion, states: Sequence[ArmState]) -> FloatArray:
         """Measured joints ``(A, J)`` minus the first ones of ``motion``; raises `StoppedError` where they are far."""
@@ -169,21 +149,22 @@ class Station:
         self,
         command: Callable[[Sequence[ArmState]], Sequence[Command] | None],
         checked: Callable[[Sequence[Command]], Sequence[Command]],
-        log: _Log | None,
+        keep: Callable[[Step], object],
     ) -> None:
         states = self.states()
         self.gate.start(states)
         try:
             with _undisturbed():
-                ticker = Ticker(self.rate_hz * self.config.pace)
+                period, due = 1 / (self.rate_hz * self.config.pace), time.monotonic()
                 while (wanted := command(states)) is not None:
-                    now = self.sent_at = ticker.wait()
+                    due = max(due + period, time.monotonic())  # a missed deadline is not caught up with
+                    time.sleep(max(due - time.monotonic(), 0.0))
+                    now = self.sent_at = time.monotonic()
                     sent = checked(wanted)
                     for follower, one in zip(self.followers, sent, strict=True):
                         follower.command(one)
                     states = self.states()
-                    if log is not None:
-                        log.add(now, sent, states)
+                    keep((now, sent, states))
                     self.gate.judge(states)
         finally:
             self.stop()  # also after the last command: the servos' watchdog would not let them go on later
@@ -202,30 +183,14 @@ def _undisturbed() -> Iterator[None]:
             gc.enable()
 
 
-class _Log:
-    """Rows of a `MeasuredPath`, in memory that is reserved before the motion."""
-
-    def __init__(self, rows: int, shape: tuple[int, ...]):
-        arms, joints = shape
-        self._commanded = np.empty((rows, arms, joints + 1))
-        self._measured = np.empty_like(self._commanded)
-        self._loads, self._seconds, self._count = np.empty((rows, arms)), np.empty(rows), 0
-
-    def add(self, now: float, commands: Sequence[Command], states: Sequence[ArmState]) -> None:
-        row = self._count
-        for arm, (told, state) in enumerate(zip(commands, states, strict=True)):
-            self._commanded[row, arm, :-1], self._commanded[row, arm, -1] = told.joints, told.finger_travel
-            self._measured[row, arm, :-1], self._measured[row, arm, -1] = state.joints, state.finger_travel
-            self._loads[row, arm] = state.grip_load
-        self._seconds[row] = now
-        self._count += 1
-
-    def path(self, rate_hz: float, arms: Sequence[Arm]) -> MeasuredPath:
-        n = self._count
-        commanded, measured = self._commanded[:n], self._measured[:n]
-        seconds = self._seconds[:n] - self._seconds[0] if n else np.zeros(0)
-        told, moved = (tool_points(joints[..., :-1], arms) for joints in (commanded, np.nan_to_num(measured)))
-        return MeasuredPath(rate_hz, commanded, measured, told, moved, self._loads[:n], seconds)
+def _path_of(steps: Sequence[Step], rate_hz: float, arms: Sequence[Arm]) -> MeasuredPath:
+    shape = (len(steps), len(arms), len(arms[0].home) + 1)
+    commanded = np.array([[[*one.joints, one.finger_travel] for one in sent] for _, sent, _ in steps]).reshape(shape)
+    measured = np.array([[[*one.joints, one.finger_travel] for one in states] for *_, states in steps]).reshape(shape)
+    loads = np.array([[one.grip_load for one in states] for *_, states in steps]).reshape(shape[:2])
+    seconds = np.array([at for at, *_ in steps])
+    told, moved = (tool_points(joints[..., :-1], arms) for joints in (commanded, np.nan_to_num(measured)))
+    return MeasuredPath(rate_hz, commanded, measured, told, moved, loads, seconds - seconds[:1])
 
 
 def _between(motion: Motion, position: float) -> tuple[FloatArray, FloatArray]:

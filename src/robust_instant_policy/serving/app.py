@@ -6,6 +6,7 @@ import asyncio
 import logging
 import secrets
 import traceback
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import FastAPI, HTTPException, Query, Request, Security, WebSocket
@@ -67,7 +68,7 @@ def make_app(planner: Planner, host: str, key: str | None, debug: bool = False) 
 
 
 def _tell(error: BaseException, debug: bool) -> str:
-    """What a client is told of an error: one line, or with ``debug`` its traceback."""
+    """The error as one line, or with ``debug`` its traceback."""
     if debug:
         return "".join(traceback.format_exception(error))
     return str(error) if isinstance(error, RipError) else f"unexpected {type(error).__name__} in the server"
@@ -90,17 +91,11 @@ def _add_errors(app: FastAPI, debug: bool) -> None:
         ]
         return JSONResponse({"error": excerpt("; ".join(problems))}, 422)
 
-    @app.exception_handler(MessageError)
-    async def wrong(request: Request, error: MessageError) -> JSONResponse:
-        return JSONResponse({"error": _tell(error, debug)}, 422)
+    async def failed(request: Request, error: Exception, status: int) -> JSONResponse:
+        return JSONResponse({"error": _tell(error, debug)}, status)
 
-    @app.exception_handler(QueueError)
-    async def busy(request: Request, error: QueueError) -> JSONResponse:
-        return JSONResponse({"error": _tell(error, debug)}, 429)
-
-    @app.exception_handler(Exception)
-    async def unexpected(request: Request, error: Exception) -> JSONResponse:
-        return JSONResponse({"error": _tell(error, debug)}, 500)  # uvicorn logs it
+    for kind, status in ((MessageError, 422), (QueueError, 429), (Exception, 500)):  # uvicorn logs the last
+        app.add_exception_handler(kind, partial(failed, status=status))
 
 
 def _add_http(app: FastAPI, planner: Planner, debug: bool) -> None:

@@ -1,4 +1,4 @@
-"""Who may use the server, and how much one request may hold."""
+"""Access control of the server, and limits for requests."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Send = Callable[[Message], Awaitable[None]]
 
 
 class Guard:
-    """ASGI middleware: every request needs the ``key``, if there is one, and none may come from a strange web page.
+    """ASGI middleware: requests need the ``key``, if there is one, and must not come from pages of other web sites.
 
-    A browser lets any page open a websocket to this machine, so what has an Origin must have the server's own, and on
-    a loopback address the Host must be one, too.
+    A browser lets any page open a websocket to this machine. So an Origin must be the server's own, and on a loopback
+    address the Host must be a loopback address, too.
     """
 
     def __init__(self, app: Any, host: str, key: str | None):

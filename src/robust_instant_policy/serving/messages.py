@@ -1,4 +1,4 @@
-"""What travels: observations in, chunks of actions out, as openpi's binary messages and as JSON.
+"""Messages: observations in, chunks of actions out, as openpi's binary messages and as JSON.
 
 openpi packs maps with msgpack, and an array as a map with the bytes ``__ndarray__``, ``data``, ``dtype`` and ``shape``
 as keys (a NumPy number with ``__npgeneric__``, ``data`` and ``dtype``).

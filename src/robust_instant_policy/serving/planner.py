@@ -1,4 +1,4 @@
-"""One plan at a time: a bounded queue in front of a policy, with progress and cancelling; unsafe plans are refused."""
+"""A bounded queue in front of a policy: one plan at a time, with progress and cancelling; unsafe plans are refused."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import uvicorn
 
-from robust_instant_policy.serving.address import checked_key
+from robust_instant_policy.network import checked_key
 from robust_instant_policy.serving.app import make_app
 from robust_instant_policy.serving.guard import MAX_MESSAGE_BYTES
 from robust_instant_policy.serving.planner import Planner

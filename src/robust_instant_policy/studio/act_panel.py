@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 
 import viser
 
@@ -31,21 +32,22 @@ class ActPanel:
         self._movers: list[viser.TransformControlsHandle] = []
         self._preview = Preview(scene)
         self._stopped = threading.Event()  # asks a comparison to end
-        held = controls.held
         how_to = gui.add_markdown("Plan first. Then let a ghost show the plan, and the arm execute it.")
         self._outcome = gui.add_html("")
-        preview = gui.add_button("Preview", icon=viser.Icon.GHOST, color="gray")
-        preview.on_click(held(lambda _: session.post(lambda: self._preview.start(plans.trajectory, session.cell))))
-        execute = gui.add_button("Execute", icon=viser.Icon.PLAYER_PLAY, color="green")
-        execute.on_click(held(lambda _: session.post(self._execute)))
-        stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="red")
-        stop.on_click(held(lambda _: self._stop()))
-        again = gui.add_button("Same scene again", icon=viser.Icon.REFRESH, color="gray")
-        again.on_click(held(lambda _: session.post(self._begin_again)))
+
+        def show(_: object) -> None:
+            session.post(lambda: self._preview.start(plans.trajectory, session.cell))
+
+        button, icons = partial(controls.button, gui), viser.Icon
+        button("Preview", show, icon=icons.GHOST, color="gray")
+        execute = button("Execute", lambda _: session.post(self._execute), icon=icons.PLAYER_PLAY, color="green")
+        button("Stop", lambda _: self._stop(), icon=icons.PLAYER_STOP, color="red")
+        again = button("Same scene again", lambda _: session.post(self._begin_again), icon=icons.REFRESH, color="gray")
         self._move = gui.add_checkbox("Move objects", False, hint="before the arm moves")
         controls.input(self._move, lambda _: session.post(self.show_movers))
-        compare = gui.add_button("Compare methods in this scene", icon=viser.Icon.SCALE, color="gray")
-        compare.on_click(held(lambda _: session.post(self._compare)))
+        compare = button(
+            "Compare methods in this scene", lambda _: session.post(self._compare), icon=icons.SCALE, color="gray"
+        )
         self._table = gui.add_html("")
         self.with_arms = (how_to, execute, again, self._move, compare)  # controls that need an arm
 

@@ -1,4 +1,4 @@
-"""What the studio needs from a robot cell, simulated, recorded or real."""
+"""The studio's interface to a cell, simulated or recorded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who holds the controls: one browser; the others watch."""
+"""Only one browser controls the page; the others watch."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Any
 
 import viser
 
+Action = Callable[[Any], None]
 Callback = Callable[[Any], Awaitable[None]]
 NOTE_S = 4.0
 
 
 class Controls:
-    """Lets the events of one browser through. The first to come holds the controls until it leaves or another one
-    presses the button that only onlookers have."""
+    """Accepts the events of one browser only: the first one, until it leaves or another one takes the controls with a
+    button."""
 
     def __init__(self, server: viser.ViserServer):
         self._server = server
@@ -24,7 +25,7 @@ class Controls:
         server.on_client_connect(self._come)
         server.on_client_disconnect(self._leave)
 
-    def held(self, action: Callable[[Any], None]) -> Callback:
+    def held(self, action: Action) -> Callback:
         """A callback that calls ``action(event)`` for the holder's events only."""
 
         async def callback(event: Any) -> None:
@@ -41,7 +42,13 @@ class Controls:
 
         return callback
 
-    def input(self, handle: Any, action: Callable[[Any], None]) -> None:
+    def button(self, gui: viser.GuiApi, label: str, action: Action, **look: Any) -> viser.GuiButtonHandle:
+        """A button that calls ``action(event)`` when the holder presses it."""
+        handle = gui.add_button(label, **look)
+        handle.on_click(self.held(action))
+        return handle
+
+    def input(self, handle: Any, action: Action) -> None:
         """Call ``action(event)`` when the holder changes the input ``handle``; what an onlooker changes is undone."""
         accepted = handle.value
 

@@ -1,4 +1,4 @@
-"""Geometry that the page shows; nothing here knows the browser."""
+"""Geometry that the page shows, independent of the browser."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from PIL import Image
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import Plan
 from robust_instant_policy.studio.cell import Surface
-from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
+from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
 MAX_TEXTURE_PIXELS = 512
 ROUGHNESS = 0.75
@@ -58,12 +58,16 @@ def _looks_up(surface: Surface) -> np.ndarray:
 
 
 def _mesh(surface: Surface, faces: np.ndarray, name: str) -> trimesh.Trimesh:
+    image = None
+    if surface.texture is not None:
+        image = Image.fromarray(np.ascontiguousarray(surface.texture))
+        image.thumbnail((MAX_TEXTURE_PIXELS, MAX_TEXTURE_PIXELS))
     material = trimesh.visual.material.PBRMaterial(
         name=name,
         baseColorFactor=np.clip(surface.colour * 255, 0, 255).astype(np.uint8),
         metallicFactor=0.0,
         roughnessFactor=ROUGHNESS,
-        baseColorTexture=None if surface.texture is None else _image(surface.texture),
+        baseColorTexture=image,
     )
     visual = trimesh.visual.TextureVisuals(uv=surface.uvs, material=material)
     return trimesh.Trimesh(surface.vertices, faces, visual=visual, process=False)
@@ -74,17 +78,6 @@ def _mark_unlit(tree: dict[str, Any]) -> None:
         if material["name"] == UNLIT:
             material["extensions"] = {UNLIT: {}}
             tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), UNLIT})
-
-
-def _image(texture: np.ndarray) -> Image.Image:
-    image = Image.fromarray(np.ascontiguousarray(texture))
-    image.thumbnail((MAX_TEXTURE_PIXELS, MAX_TEXTURE_PIXELS))
-    return image
-
-
-def tool_path(trajectory: Trajectory, arm: int) -> FloatArray:
-    """Midpoints ``(T, 3)`` between the fingertips, metres."""
-    return trajectory.triplets[:, arm, 1:].mean(axis=1)
 
 
 def polyline(points: FloatArray) -> FloatArray:
@@ -101,7 +94,7 @@ def weighed(plan: Plan, index: int, arm: int) -> tuple[FloatArray, np.ndarray]:
     weight = np.interp(candidate.times, plan.trajectory.times, plan.weights[index])
     share = np.clip(weight, 0, 1)[:, None]
     colours = (share * FOLLOWED + (1 - share) * IGNORED).astype(np.uint8)
-    segments, steps = polyline(tool_path(candidate, arm)), np.arange(len(candidate) - 1)
+    segments, steps = polyline(candidate.tool_points[:, arm]), np.arange(len(candidate) - 1)
     shown = np.ones(len(steps), dtype=bool)
     if plan.hallucinated[index]:
         shown = (steps < plan.onset[index]) | (steps // DASH % 2 == 0)

@@ -1,4 +1,4 @@
-"""Arms that follow dragged target poses, with the inverse kinematics, limits and checks of every other motion."""
+"""Arms that follow dragged target poses, with the same inverse kinematics, limits and checks as other motions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from robust_instant_policy.motion.capsules import ArmShape
 from robust_instant_policy.motion.waypoints import plan_onward
 from robust_instant_policy.trajectory import Trajectory
 
-RESPONSE_S = 0.08  # time constant with which the gripper closes in on its target
+RESPONSE_S = 0.08  # time constant of the gripper's approach to its target
 TURN_SPEED_RAD_S = 2.0
 ARRIVED_M, ARRIVED_RAD = 2e-4, 2e-3
 LINK_M = 0.005  # by which capsules around links may enter the table, or each other: they are larger than the links
@@ -39,9 +39,9 @@ class Follower:
     def towards(self, targets: FloatArray, closed: np.ndarray) -> tuple[Motion | None, str]:
         """The next motion towards ``targets (A, 4, 4)`` with gripper states ``closed (A,)`` bool.
 
-        None where there is nothing to do. A step that a check refuses is tried again along the table and along the
-        vertical only, so that a gripper slides along the border of its reach; the second value is the refusal, empty
-        where the whole step is possible.
+        None if there is nothing to do. If a check refuses a step, its horizontal and its vertical part are tried, so
+        that a gripper slides along the border of its reach; the second value is the refusal, empty if the whole step is
+        possible.
         """
         here = self.motion.poses[-1]
         if (closed == self.motion.closed[-1]).all() and all(map(_arrived, here, targets)):

@@ -1,7 +1,7 @@
-"""The door of the page: an address that others can reach needs a token, and no other web site may use the page.
+"""Access control of the page: an address that others can reach needs a token; other web sites may not use the page.
 
 viser listens on the loopback interface only; the gate passes connections on to it. The token is the first part of the
-address' path, so that it also stands in the address of the page's websocket.
+address' path, so the page's websocket has it, too.
 """
 
 from __future__ import annotations

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from PIL import Image
 
+from robust_instant_policy.datasets.images import encode_image
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.policies import Context, LocatedScene, Plan
@@ -18,6 +17,7 @@ from robust_instant_policy.policies import Context, LocatedScene, Plan
 BLUE, RED, GREEN, ORANGE, GREY = "#2e6f95", "#b3262e", "#2a7d3f", "#b35c00", "#5b6470"
 GOOD, FAIR = 0.9, 0.5  # confidence from which a plan is shown in green, and in orange
 MARGIN, LEAST_SHARE = 1.4, 0.3  # of the image that is shown: times the box of the keypoints, and at least
+JPEG_QUALITY = 88
 KEYPOINT_PX = 5  # radius of a mark, where the picture is 256 pixels wide
 OBJECT_COLOURS = ("#e6194b", "#ffe119", "#4363d8", "#3cb44b", "#f58231", "#911eb4", "#42d4f4", "#f032e6")
 
@@ -81,9 +81,7 @@ def trust(plan: Plan, available: int, complete: bool) -> str:
 def keypoint_picture(rgb: np.ndarray, context: Context | None = None, scene: LocatedScene | None = None) -> str:
     """HTML of the start image, with the keypoints of ``scene``; the pointer on one tells what is known of it."""
     height, width = rgb.shape[:2]
-    with io.BytesIO() as buffer:
-        Image.fromarray(rgb).save(buffer, "JPEG", quality=88)
-        data = base64.b64encode(buffer.getvalue()).decode()
+    data = base64.b64encode(encode_image(rgb, "jpeg", quality=JPEG_QUALITY)).decode()
     part, marks = np.array([0.0, 0.0, width, height]), []
     if context is not None and scene is not None:
         pixels = scene.located.pixels + 0.5

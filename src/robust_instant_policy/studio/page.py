@@ -157,29 +157,29 @@ class Page:
         self._server.flush()
 
     def _build(self) -> None:
-        gui, held, session = self._gui, self._controls.held, self.session
+        gui, session = self._gui, self.session
         how_to = gui.add_markdown(HOW_TO)
         self._kept = gui.add_markdown("")
-        keep = gui.add_button("Keep (Enter)", icon=viser.Icon.CHECK, color="green")
-        keep.on_click(held(self._keep))
-        grip = gui.add_button("Close / open gripper (Space)", icon=viser.Icon.ARROWS_HORIZONTAL)
-        grip.on_click(held(lambda _: session.post(partial(session.grip, self._arm))))
-        undo = gui.add_button("Undo (Z)", icon=viser.Icon.ARROW_BACK_UP)
+        button, icons = partial(self._controls.button, gui), viser.Icon
+        keep = button("Keep (Enter)", self._keep, icon=icons.CHECK, color="green")
+        grip = button(
+            "Close / open gripper (Space)",
+            lambda _: session.post(partial(session.grip, self._arm)),
+            icon=icons.ARROWS_HORIZONTAL,
+        )
+        undo = button("Undo (Z)", self._undo, icon=icons.ARROW_BACK_UP)
         self._back = gui.add_slider("Undo by, s", min=0.5, max=10.0, step=0.5, initial_value=UNDO_S)
-        undo.on_click(held(lambda _: session.post(lambda: session.undo(self._back.value))))
-        discard = gui.add_button("Discard, begin again (X)", icon=viser.Icon.TRASH, color="gray")
-        discard.on_click(held(lambda _: session.post(session.discard)))
-        scene = gui.add_button("Another scene", icon=viser.Icon.DICE, color="gray")
-        scene.on_click(held(lambda _: session.post(self._new_scene)))
+        discard = button("Discard, begin again (X)", self._discard, icon=icons.TRASH, color="gray")
+        button("Another scene", lambda _: session.post(self._new_scene), icon=icons.DICE, color="gray")
         self._with_arms = (how_to, keep, grip, undo, self._back, discard)
 
     def _bind_keys(self) -> None:
-        held, session = self._controls.held, self.session
+        held = self._controls.held
         actions: dict[str, tuple[str, Callable[[Any], None]]] = {
             "space": ("Close or open the gripper", self._grip),
             "enter": ("Keep the demonstration", self._keep),
-            "Z": ("Undo", lambda _: session.post(lambda: session.undo(self._back.value))),
-            "X": ("Discard and begin again", lambda _: session.post(session.discard)),
+            "Z": ("Undo", self._undo),
+            "X": ("Discard and begin again", self._discard),
             "C": ("Keys move the other arm", lambda _: self._choose_arm()),
         }
         for key, (way, turn) in WAYS.items():
@@ -259,6 +259,12 @@ class Page:
             self._new_scene()
 
         self.session.post(keep)
+
+    def _undo(self, event: Any) -> None:
+        self.session.post(lambda: self.session.undo(self._back.value))
+
+    def _discard(self, event: Any) -> None:
+        self.session.post(self.session.discard)
 
     def _grip(self, event: Any) -> None:
         now, before = time.monotonic(), self._gripped_at

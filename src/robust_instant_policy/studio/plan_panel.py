@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import viser
@@ -58,16 +59,14 @@ class PlanPanel:
         self._observation: Observation | None = None
         self._dragged: dict[int, tuple[float, FloatArray]] = {}
         self._lock = threading.RLock()  # of all that is drawn: events of the page and the planner's thread change it
-        held = controls.held
         self._config = gui.add_dropdown("Configuration", tuple(CONFIGS))
         controls.input(self._config, lambda _: self._configure())
-        scene = gui.add_button("New scene", icon=viser.Icon.DICE, color="gray")
-        scene.on_click(held(lambda _: session.post(new_scene)))
-        gui.add_button("Plan", icon=viser.Icon.BULB).on_click(held(lambda _: session.post(self._start)))
+        button = partial(controls.button, gui)
+        button("New scene", lambda _: session.post(new_scene), icon=viser.Icon.DICE, color="gray")
+        button("Plan", lambda _: session.post(self._start), icon=viser.Icon.BULB)
         self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
         self._doing = gui.add_html("")
-        self._cancel = gui.add_button("Cancel", color="gray", visible=False)
-        self._cancel.on_click(held(lambda _: self._give_up()))
+        self._cancel = button("Cancel", lambda _: self._give_up(), color="gray", visible=False)
         self._trust = gui.add_html(NOTHING)
         self._queries = gui.add_slider("Candidates Q", min=1, max=MOST_QUERIES, step=1, initial_value=5)
         self._dof = gui.add_slider("ν of the t", min=0.5, max=10.0, step=0.5, initial_value=1.5)
@@ -114,7 +113,7 @@ class PlanPanel:
         self._show_points()
 
     def _show_points(self) -> None:
-        """What the camera saw, where it is asked for, or where there is nothing else to see."""
+        """Show the point cloud if it is wanted, or if there is nothing else to show."""
         cell = self._session.cell
         wanted = self._points.value or (cell is not None and not cell.arms)
         self._stage.show_points(self._observation if wanted else None)

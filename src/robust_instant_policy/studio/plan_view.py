@@ -1,4 +1,4 @@
-"""What of a plan is drawn in the 3-D scene."""
+"""Draws a plan in the 3-D scene."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class PlanView:
             self._path(f"gaussian/{arm}", gaussian, arm, GAUSSIAN, 3.0)
             self._path(f"robust/{arm}", plan.trajectory, arm, ROBUST, 6.0)
             if "Spread" in layers:
-                vertices, faces = drawing.tube(drawing.tool_path(plan.trajectory, arm), drawing.spread(plan, arm))
+                vertices, faces = drawing.tube(plan.trajectory.tool_points[:, arm], drawing.spread(plan, arm))
                 tube = self._scene.add_mesh_simple(
                     f"/plan/tube/{arm}", vertices, faces, color=TUBE, opacity=0.35, side="double"
                 )
@@ -93,7 +93,7 @@ class PlanView:
     def _path(
         self, name: str, trajectory: Trajectory, arm: int, colour: tuple[int, int, int], thickness: float
     ) -> None:
-        self._line(name, drawing.polyline(drawing.tool_path(trajectory, arm)), np.array(colour), thickness)
+        self._line(name, drawing.polyline(trajectory.tool_points[:, arm]), np.array(colour), thickness)
 
     def _line(self, name: str, segments: FloatArray, colours: np.ndarray, thickness: float) -> None:
         if len(segments):
@@ -109,7 +109,7 @@ class PlanView:
             handle = self._scene.add_transform_controls(
                 f"/plan/drag/{index}", scale=0.08, disable_rotations=True, depth_test=False, line_width=3.0
             )
-            handle.position = start = drawing.tool_path(candidate, 0)[step]
+            handle.position = start = candidate.tool_points[step, 0]
             self._handles.append(handle)
             self._follow(handle, index, float(candidate.times[step]), start)
 

@@ -1,4 +1,4 @@
-"""Planning beside the running cell: stages that can be cancelled, and regressions that are drawn again at once."""
+"""Planning in a thread beside the running cell: stages can be cancelled, regressions are repeated at once."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import threading
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -32,16 +33,16 @@ from robust_instant_policy.policies.aggregation import agree, take_first
 from robust_instant_policy.policies.sampling import MIN_CANDIDATES, NO_SAMPLES
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
-DRAG_REACH = 0.12  # share of the trajectory's time over which a candidate that is dragged away gives way
-CLOSE_TIMEOUT_S = 5.0  # for the stage of a cancelled plan to end; a model that is busy longer is left to the system
+DRAG_REACH = 0.12  # standard deviation, in normalised time, of the bump that a drag adds to a candidate
+CLOSE_TIMEOUT_S = 5.0  # for the stage of a cancelled plan to end; a model that is busy longer is not closed
 PAPER_ESTIMATOR = "em-number"  # the model of the paper's networks, fitted exactly in milliseconds
 
 
 @dataclass(frozen=True)
 class Choices:
-    """What is drawn again at once: ``queries`` Q of the candidates, ``dof`` ν, ``estimator``, and ``noise`` in metres
-    (standard deviation) added to the candidates. ``dragged`` are candidates that a person moved: index to the time
-    in [0, 1] and the shift ``(3,)`` in metres there."""
+    """Settings that redraw the plan: ``queries`` Q, ``dof`` ν, ``estimator``, and ``noise`` (standard deviation,
+    metres) of the candidates. ``dragged`` are candidates that a person moved: index to the time in [0, 1] and the
+    shift ``(3,)`` in metres there."""
 
     queries: int = 5
     dof: float = 1.5
@@ -52,7 +53,7 @@ class Choices:
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """Everything that is known about one scene; ``candidates`` as the language model gave them so far."""
+    """What is known about one scene: the ``proposal`` has the candidates of the language model so far."""
 
     context: Context
     scene: LocatedScene
@@ -136,22 +137,15 @@ class Planner:
     ) -> None:
         """Plan for ``observation`` with Q ``queries``; an earlier plan is cancelled."""
         self._job += 1
-        work = self._job, tuple(demonstrations), observation, settings, queries
-        threading.Thread(target=self._work, args=work, name="planner", daemon=True).start()
+        plan = partial(self._plan, tuple(demonstrations), observation, settings, queries)
+        threading.Thread(target=self._work, args=(self._job, plan), name="planner", daemon=True).start()
 
     def cancel(self) -> None:
         """End planning; the result of a stage that is under way is dropped."""
         self._job += 1
         self._on_end("")
 
-    def _work(
-        self,
-        job: int,
-        demonstrations: tuple[Demonstration, ...],
-        observation: Observation,
-        settings: Settings,
-        queries: int,
-    ) -> None:
+    def _work(self, job: int, plan: Callable[[Callable[..., None]], None]) -> None:
         def stage(name: str, share: float | None = None) -> None:
             if job != self._job:
                 raise Cancelled
@@ -160,7 +154,7 @@ class Planner:
         try:
             stage("waiting for the plan before")
             with self._lock:
-                self._plan(stage, demonstrations, observation, settings, queries)
+                plan(stage)
             stage("done", 1.0)
             self._on_end("")
         except Cancelled:
@@ -176,11 +170,11 @@ class Planner:
 
     def _plan(
         self,
-        stage: Callable[..., None],
         demonstrations: tuple[Demonstration, ...],
         observation: Observation,
         settings: Settings,
         queries: int,
+        stage: Callable[..., None],
     ) -> None:
         if not demonstrations:
             raise UsageError("nothing was demonstrated yet: show the task first")

@@ -1,12 +1,12 @@
-"""A translucent ghost of the arms that goes along a plan."""
+"""Animation of a plan: a translucent copy of the arms moves along it."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import viser
@@ -17,12 +17,13 @@ from robust_instant_policy.studio.cell import Cell
 from robust_instant_policy.studio.stage import place
 from robust_instant_policy.trajectory import Trajectory
 
-SECONDS, RATE_HZ = 5.0, 25.0
+RATE_HZ, NUM_STEPS = 25.0, 125
+T = TypeVar("T")
 COLOUR, OPACITY = (46, 134, 171), 0.35
 
 
 class Preview:
-    """Shows one ghost at a time in ``scene``, in a thread of its own."""
+    """Shows one animation at a time in ``scene``, in its own thread."""
 
     def __init__(self, scene: viser.SceneApi):
         self._scene = scene
@@ -32,15 +33,15 @@ class Preview:
         self._stopped.set()
 
     def start(self, trajectory: Trajectory, cell: Cell | None) -> None:
-        """Let a ghost of the arms of ``cell``, or of the gripper's three points where there are none, go along
-        ``trajectory``. Raises `UnreachableError`."""
+        """Move a copy of the arms of ``cell``, or of the gripper's three points if it has none, along ``trajectory``.
+        Raises `UnreachableError`."""
         self.stop()
         self._stopped = stopped = threading.Event()
         if cell is None or not cell.arms:
             sweep = partial(self._sweep_triangle, trajectory, stopped)
         else:  # poses are computed here: the kinematics belong to the session's thread
             joints = plan_waypoints(trajectory, cell.arms, cell.execute_hz, cell.control_hz).joints
-            shown = joints[np.linspace(0, len(joints) - 1, round(SECONDS * RATE_HZ)).astype(int)]
+            shown = joints[np.linspace(0, len(joints) - 1, NUM_STEPS).astype(int)]
             poses = [
                 {
                     name: pose
@@ -57,21 +58,14 @@ class Preview:
         node = self._scene.add_line_segments(
             "/ghost/triangle", np.zeros((1, 2, 3)), COLOUR, thickness=6.0, thickness_units="screen"
         )
-        for at in np.linspace(0, 1, round(SECONDS * RATE_HZ)):
-            if stopped.is_set():
-                break
-            points = trajectory.resampled([at]).triplets[0]
+        for points in _paced(trajectory.resampled(np.linspace(0, 1, NUM_STEPS)).triplets, stopped):
             node.points = np.concatenate([points[:, [0, 1]], points[:, [0, 2]]]).astype(np.float32)
-            time.sleep(1 / RATE_HZ)
         node.remove()
 
     def _sweep(self, ghost: dict[str, Any], path: list[dict[str, FloatArray]], stopped: threading.Event) -> None:
-        for poses in path:
-            if stopped.is_set():
-                break
+        for poses in _paced(path, stopped):
             for name, node in ghost.items():
                 place(node, poses[name])
-            time.sleep(1 / RATE_HZ)
         for node in ghost.values():
             node.remove()
 
@@ -89,3 +83,12 @@ class Preview:
                     opacity=OPACITY,
                 )
         return ghost
+
+
+def _paced(steps: Iterable[T], stopped: threading.Event) -> Iterator[T]:
+    """``steps``, one each 1 / `RATE_HZ` seconds, until ``stopped`` is set."""
+    for step in steps:
+        if stopped.is_set():
+            return
+        yield step
+        time.sleep(1 / RATE_HZ)

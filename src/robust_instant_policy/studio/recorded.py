@@ -1,4 +1,4 @@
-"""A folder of demonstrations without a simulator: what the camera saw stands in for the cell."""
+"""A cell without a simulator or arm: the photographs of a folder of demonstrations."""
 
 from __future__ import annotations
 

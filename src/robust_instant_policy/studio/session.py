@@ -1,4 +1,4 @@
-"""A cell in real time, in one thread: arms that follow a person or play a plan, and demonstrations that are kept."""
+"""Runs a cell in real time, in one thread: arms follow a person or play a plan; demonstrations are stored."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import queue
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,7 +20,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Motion
 from robust_instant_policy.studio.cell import Cell
 from robust_instant_policy.studio.follower import Follower
-from robust_instant_policy.studio.take import Take, edited
+from robust_instant_policy.studio.take import Step, edited
 from robust_instant_policy.trajectory import Trajectory
 
 FRAME_HZ = 30.0  # at which the page is told of new poses
@@ -49,7 +49,7 @@ class Status:
 
 
 class Watcher(Protocol):
-    """What a session tells about; every method is called in its thread."""
+    """Receives the events of a session; all methods are called in its thread."""
 
     def on_scene(self, cell: Cell, observation: Observation) -> None:
         """There is a new scene."""
@@ -67,7 +67,7 @@ class Watcher(Protocol):
 
 
 class Session:
-    """Runs `run` until `stop`; all other methods belong into its thread, where `post` has them called."""
+    """`run` returns after `stop`; all other methods must be called in its thread, by `post`."""
 
     def __init__(self, watcher: Watcher):
         self.cell: Cell | None = None
@@ -77,12 +77,12 @@ class Session:
         self.watcher = watcher
         self._jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
         self._stopped = False
-        self._take = Take()
+        self._take: list[Step] = []
         self._moved: dict[str, FloatArray] = {}
-        self._steps: deque[tuple[FloatArray, FloatArray, np.ndarray]] = deque()  # command, poses, closed
+        self._steps: deque[Step] = deque()  # that are still to be done
         self._targets = np.zeros((0, 4, 4))
         self._closed = np.zeros(0, dtype=bool)
-        self._follower: Follower | None = None
+        self._follower: Follower  # of a cell with arms, from the first scene on
         self._on_played: Callable[[str | None], None] | None = None
 
     def post(self, job: Job) -> None:
@@ -159,7 +159,7 @@ class Session:
 
     def release(self) -> None:
         """End of a drag: targets that could not be followed go back to the grippers."""
-        if self._follower is not None and self.status.refusal:
+        if self.status.refusal:
             self._targets = self._follower.motion.poses[-1].copy()
             self._set(refusal="")
 
@@ -173,17 +173,15 @@ class Session:
         if self.status.phase != "recording" or self.cell is None:
             raise UsageError("nothing is being recorded")
         take = self._take
-        take.cut(max(len(take) - round(seconds * self.cell.control_hz), 0))
+        del take[max(len(take) - round(seconds * self.cell.control_hz), 0) :]
         self._reset(self.seed)
-        if len(take):
+        if take:
             self._take = take
-            for command in take.commands:
-                self.cell.advance(command)
-            assert self._follower is not None
-            joints = take.commands[-1].reshape(len(self.cell.arms), -1)
-            end = take.poses[-1][None], take.closed[-1][None]
-            self._follower.resume(Motion(joints[None, :, :-1], joints[None, :, -1], *end))
-            self._targets, self._closed = take.poses[-1].copy(), take.closed[-1].copy()
+            for step in take:
+                self.cell.advance(step.command)
+            joints = step.command.reshape(1, len(self.cell.arms), -1)
+            self._follower.resume(Motion(joints[..., :-1], joints[..., -1], step.poses[None], step.closed[None]))
+            self._stay()
             self._set(phase="recording", seconds=len(take) / self.cell.control_hz, failure=self.cell.failure())
         self._show()
 
@@ -199,13 +197,11 @@ class Session:
         if failure := cell.failure():
             raise UsageError(f"not kept: {failure}; go on, undo or discard")
         every, rate_hz = cell.record_every, cell.control_hz / cell.record_every
-        last = len(self._take) - 1
-        chosen = range(last % every, last + 1, every)
+        chosen = self._take[(len(self._take) - 1) % every :: every]  # the last step among them
         if len(chosen) < SHORTEST_TAKE_S * rate_hz:
             raise UsageError(f"not kept: less than {SHORTEST_TAKE_S:g} s were recorded")
-        poses, closed = edited(
-            np.array([self._take.poses[i] for i in chosen]), np.array([self._take.closed[i] for i in chosen]), rate_hz
-        )
+        poses, closed = (np.array([getattr(step, name) for step in chosen]) for name in ("poses", "closed"))
+        poses, closed = edited(poses, closed, rate_hz)
         demonstration = Demonstration(
             self.observation,
             Trajectory.from_poses(poses, closed, cell.triangle),
@@ -228,9 +224,8 @@ class Session:
         self.require_no_recording()
         if self.status.phase != "ready":
             self.discard()
-        self._queue(motion)
+        self._steps.extend(_steps_of(motion))
         self._on_played = on_played
-        assert self._follower is not None
         self._follower.resume(motion)
         self._set(phase="playing")
 
@@ -254,7 +249,6 @@ class Session:
         """Stop the motion that is being played where the arms are; returns whether there was one."""
         if self.status.phase != "playing":
             return False
-        assert self._follower is not None
         motion = self._follower.motion
         done = max(len(motion.poses) - len(self._steps), 1)
         self._follower.resume(
@@ -294,7 +288,7 @@ class Session:
         self.observation, self.seed = cell.reset(seed), seed
         for body, pose in self._moved.items():
             self.observation = cell.move(body, pose)
-        self._take, self._on_played = Take(), None
+        self._take, self._on_played = [], None
         self._steps.clear()
         self._closed = np.zeros(len(cell.arms), dtype=bool)
         if cell.arms:
@@ -303,12 +297,12 @@ class Session:
         self.status = Status("ready", closed=tuple(self._closed), failure=cell.failure())
 
     def _is_operated(self) -> bool:
-        return self.status.phase in ("ready", "recording", "done") and self._follower is not None
+        has_arms = self.cell is not None and len(self.cell.arms) > 0
+        return has_arms and self.status.phase in ("ready", "recording", "done")
 
     def _tick(self) -> None:
         """One control step."""
         assert self.cell is not None
-        assert self._follower is not None
         phase = self.status.phase
         if self.status.is_full:
             return  # the cell waits for the recording to be kept, cut or discarded
@@ -320,32 +314,29 @@ class Session:
             if refusal != self.status.refusal:
                 self._set(refusal=refusal)
             if motion is not None:
-                if phase == "ready":
+                if phase == "ready":  # a demonstration begins open, at home
                     phase = "recording"
-                    self._queue(Motion.at_home(self.cell.arms))  # a demonstration begins open, at home
-                self._queue(motion)
+                    self._steps.extend(_steps_of(Motion.at_home(self.cell.arms)))
+                self._steps.extend(_steps_of(motion))
         if phase == "ready":
             return  # the scene waits, so that a recording can be replayed from its beginning
-        if self._steps:
-            command, poses, closed = self._steps.popleft()
-        else:
-            end = self._follower.motion
-            command, poses, closed = end.commands[-1], end.poses[-1], end.closed[-1]
-        self.cell.advance(command)
+        end = self._follower.motion
+        step = self._steps.popleft() if self._steps else Step(end.commands[-1], end.poses[-1], end.closed[-1])
+        self.cell.advance(step.command)
         if phase == "recording":
-            self._take.append(command, poses, closed)
+            self._take.append(step)
             seconds = len(self._take) / self.cell.control_hz
             self._set(phase=phase, seconds=seconds, is_full=seconds >= LONGEST_TAKE_S)
 
-    def _queue(self, motion: Motion) -> None:
-        self._steps.extend(zip(motion.commands, motion.poses, motion.closed, strict=True))
+    def _stay(self) -> None:
+        """Aim at the end of the last motion."""
+        end = self._follower.motion
+        self._targets, self._closed = end.poses[-1].copy(), end.closed[-1].copy()
 
     def _played(self) -> None:
         assert self.cell is not None
-        assert self._follower is not None
         self._steps.clear()
-        self._targets = self._follower.motion.poses[-1].copy()
-        self._closed = self._follower.motion.closed[-1].copy()
+        self._stay()
         self._set(phase="done", failure=self.cell.failure())
         done, self._on_played = self._on_played, None
         if done is not None:
@@ -358,3 +349,7 @@ class Session:
         assert self.cell is not None
         self._set(closed=tuple(map(bool, self._closed)))
         self.watcher.on_frame(self.cell.poses(), self.cell.tool_poses(), self._targets, self.status)
+
+
+def _steps_of(motion: Motion) -> Iterator[Step]:
+    return map(Step, motion.commands, motion.poses, motion.closed)

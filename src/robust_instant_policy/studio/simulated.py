@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import UsageError
@@ -156,9 +157,8 @@ class _MujocoBodies:
         model, data = self._env.model, self._env.data
         joint = model.body(body).jntadr[0]
         start, speed = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-        quaternion = np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, pose[:3, :3].ravel())
-        data.qpos[start : start + 7] = [*pose[:3, 3], *quaternion]
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        data.qpos[start : start + 7] = [*pose[:3, 3], w, x, y, z]
         data.qvel[speed : speed + 6] = 0.0
         mujoco.mj_forward(model, data)
 
@@ -170,10 +170,8 @@ class _MujocoBodies:
             kind = mujoco.mjtGeom(model.geom_type[geom])
             if model.geom_group[geom] > 2 or model.geom_rgba[geom, 3] == 0 or kind == mujoco.mjtGeom.mjGEOM_PLANE:
                 continue
-            pose = np.eye(4)
-            rotation = np.zeros(9)
-            mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-            pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), model.geom_pos[geom]
+            rotation = Rotation.from_quat(model.geom_quat[geom][[1, 2, 3, 0]])
+            pose = make_pose(rotation.as_matrix(), model.geom_pos[geom])
             body = model.body(model.geom_bodyid[geom]).name
             yield (
                 _mesh(model, geom, body, pose)

@@ -11,7 +11,7 @@ import viser
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.geometry import FloatArray, lift, make_pose
+from robust_instant_policy.geometry import FloatArray, make_pose
 from robust_instant_policy.studio import drawing
 from robust_instant_policy.studio.cell import Cell, Surface
 
@@ -24,7 +24,7 @@ REFUSED = (214, 40, 57)
 
 
 class Stage:
-    """What of a cell is drawn in ``server``'s scene."""
+    """Draws a cell in ``server``'s scene."""
 
     def __init__(self, server: viser.ViserServer):
         self.scene = server.scene
@@ -59,7 +59,8 @@ class Stage:
         """Move the bodies to ``poses``."""
         with self._server.atomic():
             for name, pose in poses.items():
-                if name in self._bodies and not self._is_shown(name, pose):
+                before = self._shown.get(name)
+                if name in self._bodies and (before is None or np.abs(pose - before).max() >= MOVED):
                     place(self._bodies[name][1], pose)
                     self._shown[name] = pose
 
@@ -91,12 +92,8 @@ class Stage:
             self._points.remove()
             self._points = None
         if observation is not None:
-            rows, columns = np.nonzero(np.nan_to_num(observation.depth) > 0)
-            pixels = np.stack([columns, rows], axis=1)
-            depth = observation.depth[rows, columns]
-            points = lift(pixels, depth, observation.intrinsics, observation.camera_pose)
             self._points = self.scene.add_point_cloud(
-                "/seen", points, observation.rgb[rows, columns], point_size=POINT_M, precision="float32"
+                "/seen", *observation.points(), point_size=POINT_M, precision="float32"
             )
 
     def _show_body(self, name: str, surfaces: Sequence[Surface]) -> None:
@@ -108,9 +105,6 @@ class Stage:
         handle = self.scene.add_glb(f"/cell/{name.replace('/', '.') or 'world'}", drawing.glb(surfaces))
         self._bodies[name] = look, handle
         self._shown.pop(name, None)
-
-    def _is_shown(self, name: str, pose: FloatArray) -> bool:
-        return name in self._shown and bool(np.abs(pose - self._shown[name]).max() < MOVED)
 
 
 def place(handle: Any, pose: FloatArray) -> None:

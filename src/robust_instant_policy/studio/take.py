@@ -1,8 +1,8 @@
-"""One demonstration in the making, and what becomes of it: pauses cut, small shakes smoothed."""
+"""Steps of a demonstration that is recorded, and its editing: pauses are cut, small vibrations smoothed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -16,31 +16,16 @@ LONGEST_PAUSE_S = 0.2
 FINGERS_S = 0.5  # kept after the gripper opens or closes, however still the arm is
 
 
-@dataclass
-class Take:
-    """The control steps of a demonstration: commands ``(N, A·(J + 1))``, tool poses ``(N, A, 4, 4)`` and gripper
-    states ``(N, A)``, as lists of N arrays."""
+class Step(NamedTuple):
+    """A control step: its command ``(A·(J + 1),)``, tool poses ``(A, 4, 4)`` and gripper states ``(A,)`` bool."""
 
-    commands: list[FloatArray] = field(default_factory=list)
-    poses: list[FloatArray] = field(default_factory=list)
-    closed: list[np.ndarray] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return len(self.commands)
-
-    def append(self, command: FloatArray, poses: FloatArray, closed: np.ndarray) -> None:
-        self.commands.append(command)
-        self.poses.append(poses)
-        self.closed.append(closed)
-
-    def cut(self, length: int) -> None:
-        """Forget all but the first ``length`` steps."""
-        for steps in (self.commands, self.poses, self.closed):
-            del steps[length:]
+    command: FloatArray
+    poses: FloatArray
+    closed: np.ndarray
 
 
 def edited(poses: FloatArray, closed: np.ndarray, rate_hz: float) -> tuple[FloatArray, np.ndarray]:
-    """Tool ``poses (N, A, 4, 4)`` and states ``closed (N, A)`` at ``rate_hz`` without long pauses and shakes.
+    """Tool ``poses (N, A, 4, 4)`` and states ``closed (N, A)`` at ``rate_hz`` without long pauses and vibrations.
 
     A pause is shortened to `LONGEST_PAUSE_S`. Positions and rotations between two gripper changes are smoothed with a
     Gaussian of `SMOOTH_S`; the poses at which a gripper changes stay where they are.

@@ -1,6 +1,6 @@
 """Importing recordings: ManiSkill trajectory files, robomimic HDF5 files, LeRobot datasets.
 
-If a file lacks data of a demonstration, an error lists all of it; nothing is assumed. The user can supply missing data.
+An error lists all data that a file lacks; nothing is assumed. The user can supply missing data.
 """
 
 from robust_instant_policy.datasets.importers.convert import convert_demonstrations, import_demonstrations

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
 from robust_instant_policy.datasets import layout
-from robust_instant_policy.datasets.importers.hdf5 import members, open_hdf5
 from robust_instant_policy.datasets.importers.lerobot import read_lerobot
-from robust_instant_policy.datasets.importers.maniskill import read_maniskill
-from robust_instant_policy.datasets.importers.robomimic import read_robomimic
 from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode
 from robust_instant_policy.datasets.reader import load_demonstrations
 from robust_instant_policy.datasets.writer import DatasetWriter
@@ -27,7 +25,7 @@ def import_demonstrations(path: str | Path, task: str, rig: Rig) -> list[Demonst
     Raises `DatasetError` for another kind of file, and for one that lacks data of a demonstration; the error
     lists all of it, and how to supply it.
     """
-    return [episode.demonstration(task, rig.triangle) for episode in _read_episodes(Path(path), rig)]
+    return [episode.on(rig).demonstration(task, rig.triangle) for episode in _open(Path(path), rig)]
 
 
 def convert_demonstrations(path: str | Path, out: str | Path, task: str, description: str, rig: Rig) -> int:
@@ -38,19 +36,16 @@ def convert_demonstrations(path: str | Path, out: str | Path, task: str, descrip
     Raises `DatasetError` as `import_demonstrations` and `DatasetWriter` do.
     """
     writer = None
-    try:
+    with ExitStack() as stack:
         there: list[Demonstration] = []
-        for episode in _read_episodes(Path(path), rig):
-            demonstration = episode.demonstration(task, rig.triangle)
+        for episode in _open(Path(path), rig):
+            demonstration = episode.on(rig).demonstration(task, rig.triangle)
             if writer is None:
-                writer = DatasetWriter(out, task, description, demonstration.rate_hz)
+                writer = stack.enter_context(DatasetWriter(out, task, description, demonstration.rate_hz))
                 there = load_demonstrations(out, task=task) if writer.num_episodes else []
             if _is_new(demonstration, there, writer.path):
                 writer.add(demonstration, None if episode.images is None else episode.images())
         return 0 if writer is None else writer.num_episodes
-    finally:
-        if writer is not None:
-            writer.close()
 
 
 def _is_new(demonstration: Demonstration, there: Iterable[Demonstration], out: Path) -> bool:
@@ -67,11 +62,6 @@ def _is_new(demonstration: Demonstration, there: Iterable[Demonstration], out: P
     return True
 
 
-def _read_episodes(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
-    for episode in _open(path, rig):
-        yield episode.on(rig)
-
-
 def _open(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
     if not path.exists():
         raise DatasetError(f"there is no {path} to import")
@@ -79,6 +69,10 @@ def _open(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
         if (path / layout.INFO_PATH).exists():
             return read_lerobot(path, rig)
     else:
+        from robust_instant_policy.datasets.importers.hdf5 import members, open_hdf5  # these need an extra
+        from robust_instant_policy.datasets.importers.maniskill import read_maniskill
+        from robust_instant_policy.datasets.importers.robomimic import read_robomimic
+
         with open_hdf5(path) as file:
             names = set(members(file, "/"))
             robomimic = bool(members(file, "data"))

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.errors import DatasetError
-from robust_instant_policy.geometry import FloatArray
 
 LARGEST_CODE = 4095
 PIXEL_FORMAT = "gray12le"
@@ -47,16 +46,11 @@ def dequantised(codes: NDArray, feature: Mapping[str, Any], where: str) -> NDArr
         raise DatasetError(f"{where} has impossible depth parameters: {given}; restore its info.json")
     share = codes.astype(np.float64) / LARGEST_CODE
     with np.errstate(over="ignore", invalid="ignore"):  # of parameters beyond any camera
-        depth = _depth_of(share, near, far, shift, use_log).astype(np.float32)
-    return np.where(codes == 0, np.float32("nan"), depth)
-
-
-def _depth_of(share: FloatArray, near: float, far: float, shift: float, use_log: bool) -> FloatArray:
-    """Depth of codes at ``share`` of the way from ``near`` to ``far``, metres."""
-    if use_log:
-        low, high = np.log(near + shift), np.log(far + shift)
-        return np.exp(low + share * (high - low)) - shift
-    return near + share * (far - near)
+        depth = near + share * (far - near)
+        if use_log:
+            low, high = np.log(near + shift), np.log(far + shift)
+            depth = np.exp(low + share * (high - low)) - shift
+        return np.where(codes == 0, np.nan, depth).astype(np.float32)
 
 
 def _info(feature: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robust_instant_policy.errors import DatasetError, MissingExtraError
+from robust_instant_policy.errors import DatasetError, needs_extra
 from robust_instant_policy.files import excerpt, open_regular, parse_json
+
+with needs_extra("import"):
+    import h5py
 
 MAX_ARRAY_BYTES = 2**32  # of one array; the images of an episode are the largest
 
@@ -21,10 +24,6 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     """The open ``h5py.File``. Raises `DatasetError` for a missing or damaged file, also while it is read, and for
     one with links, because an external link refers to another file.
     """
-    try:
-        import h5py
-    except ImportError as error:
-        raise MissingExtraError("h5py", "import") from error
     try:
         open_regular(path).close()
         with h5py.File(path, "r") as file:
@@ -40,8 +39,6 @@ def open_hdf5(path: Path) -> Iterator[Any]:
 
 def has(group: Any, name: str) -> bool:
     """Whether a group holds ``name``, a path within the file."""
-    import h5py
-
     return isinstance(group, h5py.Group) and name in group
 
 
@@ -51,8 +48,6 @@ def read(group: Any, name: str, *ndim: int) -> NDArray | None:
     Raises `DatasetError` for an array of other dimensions or type, an empty or too large one, and one that is stored
     in another file.
     """
-    import h5py
-
     if not has(group, name):
         return None
     data = group[name]
@@ -71,8 +66,6 @@ def read(group: Any, name: str, *ndim: int) -> NDArray | None:
 
 def members(group: Any, name: str) -> list[str]:
     """Names in the group ``name`` of a group; empty if it is missing."""
-    import h5py
-
     inner = group[name] if has(group, name) else None
     return list(inner) if isinstance(inner, h5py.Group) else []
 
@@ -101,13 +94,3 @@ def nested(content: Mapping[str, Any], *names: str) -> dict[str, Any]:
 def first_matrix(array: NDArray | None) -> NDArray[np.float64] | None:
     """The first of the matrices ``(T, …)``, as float64."""
     return None if array is None else array[0].astype(np.float64)
-
-
-def choose_camera(path: Path, cameras: Sequence[str], wanted: str | None) -> str | None:
-    """The camera ``wanted``, or the only one. Raises `DatasetError` with the available ones."""
-    if wanted is None and len(cameras) <= 1:
-        return cameras[0] if cameras else None
-    if wanted not in cameras:
-        problem = "has several cameras" if wanted is None else f"has no camera {wanted!r}"
-        raise DatasetError(f"{path} {problem}; give camera, one of: {excerpt(', '.join(cameras)) or 'none'}")
-    return wanted

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,11 +13,11 @@ import numpy as np
 
 from robust_instant_policy.checks import checked_pose, checked_positive
 from robust_instant_policy.datasets.importers.layouts import MAX_ANGLE_RAD, arm_of
-from robust_instant_policy.errors import DatasetError, MissingExtraError
+from robust_instant_policy.errors import DatasetError, needs_extra
 from robust_instant_policy.files import excerpt, read_regular
 from robust_instant_policy.geometry import FloatArray
 
-SUFFIXES = (".pos", "_pos", ".position", "_position")
+SUFFIX = r"[._]pos(ition)?$"
 
 
 @dataclass(frozen=True)
@@ -46,13 +47,11 @@ class JointModel:
         """Poses ``(T, 4, 4)`` of the link for ``values (T, D)`` in columns called ``names``, of one ``arm`` of two
         ("left", "right"). Raises `DatasetError`.
         """
-        try:
+        with needs_extra("robots"):
             import mink
             import mujoco
-        except ImportError as error:
-            raise MissingExtraError(error.name or "mink", "robots") from error
         model = _load(mujoco, self.urdf)
-        if not _has(mujoco, model, self.link):
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, self.link) < 0:
             links = ", ".join(model.body(index).name for index in range(1, model.nbody))
             raise DatasetError(f"{self.urdf} has no link {self.link!r}; it has: {excerpt(links)}")
         chosen = self._pairs(names, [model.joint(index).name for index in range(model.njnt)], arm)
@@ -81,7 +80,7 @@ class JointModel:
         else:
             wanted = {}
             for name in columns:
-                bare = _stem(name) if arm_of(name) in ("", arm) else ""
+                bare = re.sub(SUFFIX, "", name) if arm_of(name) in ("", arm) else ""
                 for joint in (bare, bare.removeprefix(f"{arm}_"), bare.removesuffix(f"_{arm}")):
                     if joint in joints:
                         wanted.setdefault(joint, name)
@@ -115,10 +114,6 @@ def _moving(model: Any, link: str) -> list[str]:
     return joints
 
 
-def _stem(name: str) -> str:
-    return next((name.removesuffix(suffix) for suffix in SUFFIXES if name.endswith(suffix)), name)
-
-
 def _load(mujoco: Any, path: Path) -> Any:
     """The kinematics of a URDF, without its meshes. Raises `DatasetError`."""
     try:
@@ -135,7 +130,3 @@ def _load(mujoco: Any, path: Path) -> Any:
         raise DatasetError(f"there is no file {path}") from None
     except (ElementTree.ParseError, ValueError) as error:
         raise DatasetError(f"{path} is not a URDF that MuJoCo reads: {excerpt(error)}") from None
-
-
-def _has(mujoco: Any, model: Any, link: str) -> bool:
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, link) >= 0

@@ -221,7 +221,8 @@ def poses_of(
     approach = np.array([0.0, 0.0, 1.0]) if tool is None else np.asarray(tool)[:3, 2]
     orders = {"quat_xyzw": turns, "quat_wxyz": np.roll(turns, -1, axis=1)}
     matrices = {order: rotations_of(name, values, order) for order, values in orders.items()}
-    sensible = [order for order, matrix in matrices.items() if _points_down(matrix @ approach)]
+    # The gripper points down in nearly all steps.
+    sensible = [order for order, matrix in matrices.items() if np.quantile((matrix @ approach)[:, 2], 0.9) < DOWN]
     if len(sensible) != 1:
         ways = "both orders" if sensible else "neither order"
         raise DatasetError(
@@ -230,8 +231,3 @@ def poses_of(
         )
     poses[:, :3, :3] = matrices[sensible[0]]
     return poses
-
-
-def _points_down(approach: FloatArray) -> bool:
-    """Whether directions ``(T, 3)`` point down in nearly all steps."""
-    return bool(np.quantile(approach[:, 2], 0.9) < DOWN)

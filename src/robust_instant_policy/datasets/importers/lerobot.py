@@ -19,9 +19,8 @@ from robust_instant_policy.datasets import coded_depth, layout
 from robust_instant_policy.datasets.folder import Folder, open_folder
 from robust_instant_policy.datasets.images import decode_image
 from robust_instant_policy.datasets.importers.depth import PIXEL_FORMAT, dequantised, is_depth, unit_of
-from robust_instant_policy.datasets.importers.hdf5 import choose_camera
 from robust_instant_policy.datasets.importers.lerobot_poses import grippers_in, poses_in
-from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode
+from robust_instant_policy.datasets.importers.source import Rig, SourceEpisode, choose_camera
 from robust_instant_policy.datasets.importers.timing import even_steps, held, resampled, seconds_of
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt
@@ -52,6 +51,7 @@ def read_lerobot(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
         rgb = None if camera is None else _first_image(folder, episode, camera)
         depth = None if depth_key is None else _first_depth(folder, episode, depth_key, rig.depth_unit_m)
         name = f"{path} (episode {episode})"
+        tasks = told if isinstance(told := folder.episodes[episode].get("tasks"), list) else []
         frames = np.arange(folder.episodes[episode]["length"])
         seconds = None if rig.rate_hz is not None else _seconds(folder, episode, name)
         if seconds is not None:
@@ -67,17 +67,9 @@ def read_lerobot(path: Path, rig: Rig) -> Iterator[SourceEpisode]:
             gripper_values=gripper,
             rate_hz=folder.rate_hz,
             images=partial(_images, folder, episode, camera, frames) if camera in folder.video_keys else None,
-            info={
-                "source": path.name,
-                "episode": episode,
-                "description": _description(folder.episodes[episode].get("tasks")),
-            },
+            info={"source": path.name, "episode": episode, "description": "; ".join(map(str, tasks))},
             advice=ADVICE if poses is None or depth is None else "",
         )
-
-
-def _description(tasks: object) -> str:
-    return "; ".join(str(task) for task in tasks) if isinstance(tasks, list) else ""
 
 
 def _seconds(folder: Folder, episode: int, name: str) -> FloatArray | None:

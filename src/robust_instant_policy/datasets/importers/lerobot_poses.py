@@ -162,7 +162,7 @@ def _order(names: list[str]) -> tuple[int, ...] | None:
 
 def _unnamed(folder: Folder, key: str, names: list[str], rig: Rig) -> list[Columns]:
     """The pose in a feature that does not name its columns."""
-    told = "_".join(word for word in words_of(key) if word not in ARMS)
+    told = "_".join(_words(key))
     usual = next((name for name in UNNAMED_POSES if told.endswith(name)), None)
     if key != rig.pose_key and usual is None:
         return []

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from robust_instant_policy.datasets.importers.hdf5 import (
-    choose_camera,
     first_matrix,
     has,
     members,
@@ -23,7 +22,7 @@ from robust_instant_policy.datasets.importers.hdf5 import (
     read,
 )
 from robust_instant_policy.datasets.importers.layouts import Columns, poses_of
-from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode
+from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode, choose_camera
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt, read_json
 from robust_instant_policy.geometry import as_numbers, invert_pose
@@ -72,7 +71,9 @@ def _read_episode(
         raise DatasetError(f"{path} ({name}): extrinsic_cv must be (T, 3, 4), got matrices of {extrinsics.shape}")
     tcp = read(group, "obs/extra/tcp_pose", 2)
     actions = read(group, "actions", 2)
-    panda = _robots(group, kwargs) & set(PANDAS)
+    articulations = members(group, "env_states/articulations")  # moving ones
+    robots = [str(kwargs["robot_uids"])] if "robot_uids" in kwargs else articulations
+    panda = set(robots) & set(PANDAS)
     return SourceEpisode(
         name=f"{path.name} ({name})",
         rgb=None if images is None else images[0],
@@ -89,10 +90,3 @@ def _read_episode(
         info={"source": path.name, "episode": name, "source_seed": str(episode.get("episode_seed"))},
         advice=ADVICE.format(path=path) if tcp is None or depth is None else "",
     )
-
-
-def _robots(group: Any, kwargs: Mapping[str, Any]) -> set[str]:
-    """Names of the robot: from the environment's arguments, or the moving articulations."""
-    if "robot_uids" in kwargs:
-        return {str(kwargs["robot_uids"])}
-    return set(members(group, "env_states/articulations"))

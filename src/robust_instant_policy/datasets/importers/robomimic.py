@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from robust_instant_policy.datasets.importers.hdf5 import (
-    choose_camera,
     members,
     nested,
     open_hdf5,
@@ -23,7 +22,7 @@ from robust_instant_policy.datasets.importers.hdf5 import (
     read_json_attribute,
 )
 from robust_instant_policy.datasets.importers.layouts import Columns, poses_of
-from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode
+from robust_instant_policy.datasets.importers.source import GripperCommand, SourceEpisode, choose_camera
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.files import excerpt
 from robust_instant_policy.geometry import FloatArray, as_numbers

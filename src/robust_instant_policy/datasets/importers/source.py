@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,7 @@ from robust_instant_policy.datasets.importers.joints import JointModel
 from robust_instant_policy.datasets.importers.layouts import ROTATIONS
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import DatasetError, InvalidValueError
+from robust_instant_policy.files import excerpt
 from robust_instant_policy.geometry import FloatArray, GripperTriangle
 from robust_instant_policy.trajectory import Trajectory
 
@@ -41,7 +43,7 @@ class Rig:
     ``triangle`` is the gripper of the imported trajectories, that of the executing robot. ``camera`` names the camera
     of the start image. ``intrinsics (3, 3)``, ``camera_pose (4, 4)`` camera to world, OpenCV axes; ``tool (4, 4)`` the
     tool frame of `geometry` within the recorded end-effector frame; ``gripper`` the meaning of the last action or of
-    the gripper's position; ``rate_hz`` the rate of the frames, whatever their timestamps say.
+    the gripper's position; ``rate_hz`` the rate of the frames, in place of their timestamps.
 
     For LeRobot datasets, ``depth_key`` is the feature with the depth and ``depth_unit_m`` the metres per step, where
     the dataset does not say it; ``pose_key`` the one with the poses, ``rotation`` one of `layouts.ROTATIONS`, where
@@ -162,3 +164,13 @@ class SourceEpisode:
             "rate_hz": "the recording rate (in the rig: rate_hz)",
         }
         return [description for name, description in needs.items() if getattr(self, name) is None]
+
+
+def choose_camera(path: Path, cameras: Sequence[str], wanted: str | None) -> str | None:
+    """The camera ``wanted``, or the only one. Raises `DatasetError` with the available ones."""
+    if wanted is None and len(cameras) <= 1:
+        return cameras[0] if cameras else None
+    if wanted not in cameras:
+        problem = "has several cameras" if wanted is None else f"has no camera {wanted!r}"
+        raise DatasetError(f"{path} {problem}; give camera, one of: {excerpt(', '.join(cameras)) or 'none'}")
+    return wanted

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from robust_instant_policy.errors import CalibrationError, InvalidValueError, MissingExtraError, RobotError
+from robust_instant_policy.errors import CalibrationError, InvalidValueError, needs_extra
 from robust_instant_policy.geometry import FloatArray
 
 MIN_CORNERS = 8  # of a board in an image
@@ -156,10 +156,6 @@ class Board:
 
 def opencv() -> Any:
     """The module ``cv2``; raises `MissingExtraError` or `RobotError` where it cannot be imported."""
-    try:
+    with needs_extra("robots", library="libgl1"):
         import cv2
-    except ModuleNotFoundError:
-        raise MissingExtraError("OpenCV", "robots") from None
-    except ImportError as error:
-        raise RobotError(f"OpenCV cannot be loaded: {error}; on Debian: apt install libgl1") from None
     return cv2

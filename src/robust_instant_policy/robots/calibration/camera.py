@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from robust_instant_policy.errors import RobotError
-from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.robots.calibration.board import Board, BoardView
 from robust_instant_policy.robots.calibration.board_pose import (
@@ -22,7 +20,7 @@ from robust_instant_policy.robots.calibration.board_pose import (
 )
 from robust_instant_policy.robots.calibration.hand_eye import calibrate_hand_eye
 from robust_instant_policy.robots.calibration.table import BoardPlace, calibrate_on_table
-from robust_instant_policy.robots.calibration.toml import toml
+from robust_instant_policy.robots.calibration.toml import now, save_calibration
 from robust_instant_policy.robots.camera import Frame
 from robust_instant_policy.robots.cell import read_section
 
@@ -53,7 +51,7 @@ class CameraCalibration:
     date: str
 
     def save(self, path: Path) -> None:
-        """Write the TOML file that `load` reads."""
+        """Write a TOML file, of which `check_camera` and `read_camera_pose` read a part."""
         facts: dict[str, Any] = {
             "camera": self.camera,
             "date": self.date,
@@ -67,32 +65,7 @@ class CameraCalibration:
         }
         if self.depth_scale is not None:
             facts["depth_scale"] = round(self.depth_scale, 5)
-        write_whole(path, (HEADER + toml(facts) + "\n[board]\n" + toml(asdict(self.board))).encode())
-
-    @classmethod
-    def load(cls, path: Path) -> CameraCalibration:
-        """Raises `CellError` that names a missing or wrong key."""
-        section = read_section(path)
-        board = section.section("board")
-        return cls(
-            camera=section.text("camera"),
-            pose=section.array("pose", (4, 4)),
-            intrinsics=section.array("intrinsics", (3, 3)),
-            image_size=tuple(section.array("image_size", (2,)).astype(int).tolist()),
-            method=section.text("method"),
-            reprojection_px=section.number("reprojection_px"),
-            left_out_mm=tuple(section.array("left_out_mm", (None,)).tolist()),
-            touched_mm=tuple(section.array("touched_mm", (None,)).tolist()),
-            depth_scale=section.number("depth_scale") if "depth_scale" in section else None,
-            board=Board(
-                board.whole("columns"),
-                board.whole("rows"),
-                board.number("square_m"),
-                board.number("marker_m"),
-                board.text("dictionary"),
-            ),
-            date=section.text("date"),
-        )
+        save_calibration(path, HEADER, facts, board=asdict(self.board))
 
 
 def check_camera(file: Path, camera: str, frame: Frame) -> None:
@@ -100,17 +73,18 @@ def check_camera(file: Path, camera: str, frame: Frame) -> None:
 
     A file with a pose alone, written by hand, is accepted.
     """
-    if "camera" not in read_section(file):
+    section = read_section(file)
+    if "camera" not in section:
         return
-    known = CameraCalibration.load(file)
-    if camera != known.camera:
-        raise RobotError(f"{known.camera} was calibrated, but {camera} is connected; run rip calibrate camera")
-    expected = known.intrinsics[:2] / np.array(known.image_size)[:, None]
+    if camera != (known := section.text("camera")):
+        raise RobotError(f"{known} was calibrated, but {camera} is connected; run rip calibrate camera")
+    size = section.array("image_size", (2,))
+    expected = section.array("intrinsics", (3, 3))[:2] / size[:, None]
     height, width = frame.depth.shape
     if not np.allclose(frame.intrinsics[:2] / np.array([[width], [height]]), expected, rtol=0.02, atol=0.01):
         raise RobotError(
             f"the intrinsics of {camera} at {width} x {height} are not those of its calibration at "
-            f"{known.image_size[0]} x {known.image_size[1]}: another crop of the image; run rip calibrate camera"
+            f"{size[0]:g} x {size[1]:g}: another crop of the image; run rip calibrate camera"
         )
 
 
@@ -172,5 +146,5 @@ def _facts(seen: Sequence[_Seen], frame: Frame, board: Board) -> dict[str, Any]:
         "reprojection_px": float(np.sqrt(np.mean([one.error_px**2 for one in seen]))),
         "depth_scale": float(np.median(scales)) if scales else None,
         "board": board,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "date": now(),
     }

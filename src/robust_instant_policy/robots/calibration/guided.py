@@ -1,4 +1,4 @@
-"""What a person is led through to calibrate: touching, holding, photographing, copying."""
+"""Calibrations with a person: touching, holding and photographing the board, copying joints."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COUPLED = "coupled: Enter takes the reading"
 
 
 class Guide:
-    """Leads a person who moves arm ``index`` of a connected station with its leader."""
+    """Guides a person who moves arm ``index`` of a connected station with its leader."""
 
     def __init__(self, station: Station, leader: Leader, index: int, operator: Operator):
         self._station, self._index, self._operator = station, index, operator
@@ -42,15 +42,9 @@ class Guide:
         hands = []
         while len(frames) < count:
             pose = self._pose(f"pose {len(frames) + 1} of {count}: turn the board to another side, in full view")
-            with self._operator.stop.ends_waiting():
-                frame = camera.read()
-            try:
-                board.find(frame.rgb)
-            except CalibrationError as error:
-                self._operator.say(f"  not usable: {error}")
-                continue
-            frames.append(frame)
-            hands.append(pose)
+            if (frame := _photograph(camera, board, self._operator)) is not None:
+                frames.append(frame)
+                hands.append(pose)
         return frames, np.stack(hands)
 
     def _pose(self, words: str) -> FloatArray:
@@ -66,39 +60,50 @@ def photograph_places(camera: Camera, board: Board, count: int, operator: Operat
     frames: list[Frame] = []
     while len(frames) < count:
         where = "where it lies" if not frames else "at another place on the table, near another corner of the image"
-        words = f"place {len(frames) + 1} of {count}: the board {where}, in full view; Enter photographs"
-        require(operator, operator.ask(words, ENTER))
-        with operator.stop.ends_waiting():
-            frame = camera.read()
-        try:
-            board.find(frame.rgb)
+        _wait(operator, f"place {len(frames) + 1} of {count}: the board {where}, in full view; Enter photographs")
+        if (frame := _photograph(camera, board, operator)) is not None:
             frames.append(frame)
-        except CalibrationError as error:
-            operator.say(f"  not usable: {error}")
     return frames
 
 
+def _photograph(camera: Camera, board: Board, operator: Operator) -> Frame | None:
+    """A frame in which the board is found; None where it is not, which the person is told."""
+    with operator.stop.ends_waiting():
+        frame = camera.read()
+    try:
+        board.find(frame.rgb)
+    except CalibrationError as error:
+        operator.say(f"  not usable: {error}")
+        return None
+    return frame
+
+
 def copied_turns(station: Station, source: JointSource, index: int, operator: Operator) -> JointMap:
-    """The joint map of a leader arm whose person copies what arm ``index`` shows, one joint after another."""
+    """Joint map of a leader arm: arm ``index`` turns joint after joint, and the person copies it with the leader."""
     rest = station.states()[index].joints
-    ask = "give the leader the same pose as the follower; Enter"
-    require(operator, operator.ask(ask, ENTER))
+    _wait(operator, "give the leader the same pose as the follower; Enter")
     joints, readings = [rest], [source.angles()]
     highest = station.arms[index].kinematics.joint_range[:, 1]
     for joint in range(len(rest)):
         shown = rest.copy()
         shown[joint] += TURN_RAD if rest[joint] + TURN_RAD < highest[joint] else -TURN_RAD
         _show(station, index, shown, operator)
-        words = f"joint {joint + 1} of the follower turned; turn that joint of the leader alike, no other; Enter"
-        require(operator, operator.ask(words, ENTER))
+        _wait(
+            operator, f"joint {joint + 1} of the follower turned; turn that joint of the leader alike, no other; Enter"
+        )
         joints.append(station.states()[index].joints)
         readings.append(source.angles())
         _show(station, index, rest, operator)
-        require(operator, operator.ask("turn it back; Enter", ENTER))
-    require(operator, operator.ask("open the trigger; Enter", ENTER))
+        _wait(operator, "turn it back; Enter")
+    _wait(operator, "open the trigger; Enter")
     opened = source.angles()
-    require(operator, operator.ask("close the trigger; Enter", ENTER))
+    _wait(operator, "close the trigger; Enter")
     return calibrate_joints(np.array(joints), np.array(readings), opened, source.angles())
+
+
+def _wait(operator: Operator, words: str) -> None:
+    """Say ``words``, and wait for Enter."""
+    require(operator, operator.ask(words, ENTER))
 
 
 def require(operator: Operator, key: str) -> None:

@@ -66,10 +66,8 @@ def park(hands: FloatArray, boards: FloatArray) -> tuple[FloatArray, FloatArray]
     For motions A = H_j H_i⁻¹ and B = C_j C_i⁻¹, A X = X B. The rotation vectors give α = R_X β (a fit of rotations),
     the translations (R_A - I) t_X = R_X t_B - t_A.
     """
-    a, b = _motions(hands, boards)
-    alpha, beta = (Rotation.from_matrix(motion[:, :3, :3]).as_rotvec() for motion in (a, b))
-    turn, _ = Rotation.align_vectors(alpha, beta)
-    rotation = turn.as_matrix()
+    a, b, alpha, beta = _motions(hands, boards)
+    rotation = Rotation.align_vectors(alpha, beta)[0].as_matrix()
     left = np.concatenate(a[:, :3, :3] - np.eye(3))
     right = (b[:, :3, 3] @ rotation.T - a[:, :3, 3]).ravel()
     camera = make_pose(rotation, np.linalg.lstsq(left, right, rcond=None)[0])
@@ -108,13 +106,11 @@ def _pose(change: FloatArray) -> FloatArray:
     return make_pose(Rotation.from_rotvec(change[:3]).as_matrix(), change[3:])
 
 
-def _motions(hands: FloatArray, boards: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _motions(hands: FloatArray, boards: FloatArray) -> tuple[FloatArray, ...]:
+    """Motions A and B ``(N, 4, 4)`` between all pairs of poses, and their rotation vectors α and β ``(N, 3)``."""
     i, j = np.triu_indices(len(hands), 1)
-    return hands[j] @ _inverses(hands)[i], boards[j] @ _inverses(boards)[i]
-
-
-def _inverses(poses: FloatArray) -> FloatArray:
-    return np.stack([invert_pose(pose) for pose in poses])
+    motions = [poses[j] @ np.linalg.inv(poses)[i] for poses in (hands, boards)]
+    return *motions, *(Rotation.from_matrix(motion[:, :3, :3]).as_rotvec() for motion in motions)
 
 
 def _check_turns(hands: FloatArray) -> None:
@@ -134,8 +130,7 @@ def _check_scale(hands: FloatArray, boards: FloatArray) -> None:
 
     The scale s and t_X solve (R_A - I) t_X - s R_X t_B = -t_A.
     """
-    a, b = _motions(hands, boards)
-    alpha, beta = (Rotation.from_matrix(motion[:, :3, :3]).as_rotvec() for motion in (a, b))
+    a, b, alpha, beta = _motions(hands, boards)
     angles = np.linalg.norm(alpha, axis=1) - np.linalg.norm(beta, axis=1)
     if np.median(np.abs(angles)) > np.radians(5.0):
         raise CalibrationError(

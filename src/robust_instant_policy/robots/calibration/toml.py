@@ -4,7 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
+
+from robust_instant_policy.files import write_whole
+
+
+def save_calibration(path: Path, header: str, facts: Mapping[str, Any], **tables: Mapping[str, Any]) -> None:
+    """Write ``facts`` and ``tables`` as TOML behind the comments ``header``."""
+    parts = [header + toml(facts), *(f"[{name}]\n{toml(table)}" for name, table in tables.items())]
+    write_whole(path, "\n".join(parts).encode())
+
+
+def now() -> str:
+    """Date and time of a calibration, UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def toml(facts: Mapping[str, Any]) -> str:

@@ -6,16 +6,14 @@ The hand's frame is the tool frame of the arm's model, which the measured one co
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robust_instant_policy.errors import CalibrationError
-from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray, make_pose
-from robust_instant_policy.robots.calibration.toml import toml
+from robust_instant_policy.robots.calibration.toml import now, save_calibration
 
 MIN_TOUCHES = 4
 MIN_SPREAD_RAD = np.radians(10.0)  # of the directions from which the point is touched
@@ -126,7 +124,7 @@ class ToolCalibration:
             "open_travel": round(self.open_travel, 6),
             "left_out_mm": [round(error, 3) for error in self.left_out_mm],
         }
-        write_whole(path, (HEADER + toml(facts)).encode())
+        save_calibration(path, HEADER, facts)
 
 
 def calibrate_tool(
@@ -146,5 +144,4 @@ def calibrate_tool(
             " gripper did not move, or its reading is not in metres"
         )
     errors = np.concatenate([first.left_out_m, second.left_out_m]) * 1e3
-    date = datetime.now(UTC).isoformat(timespec="seconds")
-    return ToolCalibration(arm, pose, length, opening, tuple(errors.tolist()), closed_travel, open_travel, date)
+    return ToolCalibration(arm, pose, length, opening, tuple(errors.tolist()), closed_travel, open_travel, now())

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
-import os
-import sys
 from pathlib import Path
 from typing import Any
 
 from robust_instant_policy.errors import CellError
+from robust_instant_policy.plugins import own_module
 from robust_instant_policy.robots.camera import VideoCamera
 from robust_instant_policy.robots.cameras.lerobot import LeRobotCamera
 from robust_instant_policy.robots.cameras.realsense import RealSenseCamera
@@ -54,18 +52,16 @@ def make_camera(config: DeviceConfig, relative_to: Path) -> VideoCamera:
 
 
 def made_by(factory: str, where: str) -> Any:
-    """What the callable ``module:name`` of one's own makes; the module is installed or lies in the working directory.
+    """Call ``factory``, "module:function" of an installed module or of one in the working directory.
 
-    Raises `CellError` where it is not there, and for whatever it raises.
+    Raises `CellError` if it does not exist or raises an error.
     """
     module, _, attribute = factory.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
     try:
-        make = getattr(importlib.import_module(module), attribute)
+        make = getattr(own_module(module), attribute)
     except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         raise CellError(
-            f"{where}: factory must be module:function of a module that is installed or lies in {os.getcwd()}: {error}"
+            f"{where}: factory must be module:function of a module that is installed or lies in {Path.cwd()}: {error}"
         ) from None
     try:
         return make()

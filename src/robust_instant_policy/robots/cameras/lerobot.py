@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.robots.camera import Frame, check_alive
+from robust_instant_policy.robots.device import answered
 
 
 class LeRobotShape(Protocol):
@@ -39,10 +40,10 @@ class LeRobotCamera:
                 f"{self.name} gives no depth that is aligned to colour; a RealSense camera is read with "
                 'kind = "realsense", another one that aligns its depth with aligned = true'
             )
-        self._answer(self._device.connect)
+        answered(self.name, self._device.connect)
 
     def read(self) -> Frame:
-        rgb, depth = self._answer(self._device.read), self._answer(self._device.read_depth)
+        rgb, depth = answered(self.name, self._device.read), answered(self.name, self._device.read_depth)
         if depth.shape[:2] != rgb.shape[:2] or depth.dtype != np.uint16:
             raise RobotError(
                 f"{self.name} gives depth {depth.shape} {depth.dtype} for an image {rgb.shape}; expected uint16 "
@@ -54,13 +55,7 @@ class LeRobotCamera:
         return Frame(rgb, metres, self._intrinsics, time.monotonic())
 
     def preview(self) -> NDArray[np.uint8]:
-        return self._answer(self._device.read)
+        return answered(self.name, self._device.read)
 
     def disconnect(self) -> None:
-        self._answer(self._device.disconnect)
-
-    def _answer(self, call):
-        try:
-            return call()
-        except (OSError, RuntimeError, ValueError, TimeoutError) as error:  # what LeRobot's cameras raise
-            raise RobotError(f"{self.name} does not answer: {error}") from error
+        answered(self.name, self._device.disconnect)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from robust_instant_policy.errors import MissingExtraError, RobotError
+from robust_instant_policy.errors import RobotError, needs_extra
 from robust_instant_policy.robots.calibration.board import opencv
 from robust_instant_policy.robots.camera import Frame, check_alive
 
@@ -33,9 +33,8 @@ STRAIGHT_PX = 0.05  # distortion below it is not undone
 class RealSenseCamera:
     """A D415, D405, D435 or D455; see `robots.camera.Camera`.
 
-    ``serial`` empty takes the only one connected. ``burst`` frames are combined into one depth image by the temporal
-    filter. A ``device`` of the SDK may be given instead of a serial number. `read` waits for a new
-    pair of frames for ``timeout_s``.
+    ``serial`` empty takes the only one connected. A ``device`` of the SDK may be given instead of a serial number.
+    `read` waits for a new pair of frames for ``timeout_s``.
     """
 
     def __init__(
@@ -44,13 +43,12 @@ class RealSenseCamera:
         width: int = 640,
         height: int = 480,
         rate_hz: int = 30,
-        burst: int = BURST,
         device: Any | None = None,
         timeout_s: float = TIMEOUT_S,
     ):
         self.name = f"realsense {serial}".strip()
         self._serial, self._device, self._timeout_s = serial, device, timeout_s
-        self._width, self._height, self._rate_hz, self._burst = width, height, rate_hz, burst
+        self._width, self._height, self._rate_hz = width, height, rate_hz
         self._sensors: list[Any] = []
         self._last = (-1, -1)  # numbers of the last depth and colour frame
         self._before: NDArray[np.uint8] | None = None
@@ -88,7 +86,7 @@ class RealSenseCamera:
         to_disparity, to_depth = rs.disparity_transform(True), rs.disparity_transform(False)
         spatial, temporal = rs.spatial_filter(), rs.temporal_filter()
         self._drain()
-        for _ in range(self._burst):
+        for _ in range(BURST):
             pair = self._pair()
             for stage in (to_disparity, spatial, temporal, to_depth):
                 pair = stage.process(pair).as_frameset()
@@ -165,12 +163,8 @@ class RealSenseCamera:
 
 def sdk() -> Any:
     """The module ``pyrealsense2``; raises `MissingExtraError` or `RobotError` where it cannot be imported."""
-    try:
+    with needs_extra("robots", library="libusb-1.0-0"):
         import pyrealsense2
-    except ModuleNotFoundError:
-        raise MissingExtraError("pyrealsense2", "robots") from None
-    except ImportError as error:
-        raise RobotError(f"pyrealsense2 cannot be loaded: {error}; on Debian: apt install libusb-1.0-0") from None
     return pyrealsense2
 
 

@@ -1,4 +1,4 @@
-"""Starts the process of an emulated cell, and looks at it."""
+"""Starts the process of an emulated cell, and reads its state."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -38,17 +37,14 @@ class Emulation:
     config: CellConfig
 
     def observation(self) -> Observation:
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "observation.npz"
-            file.write_bytes(request(f"{self.url}/observation.npz"))
-            return Observation.load(file)
+        return _photograph(self.url)
 
     def commands(self) -> FloatArray:
         """Commands ``(N, A, J + 1)`` that the arms executed."""
         return np.load(io.BytesIO(request(f"{self.url}/commands.npy")), allow_pickle=False)
 
     def times(self) -> FloatArray:
-        """When they executed them, ``(N,)`` seconds of the machine's clock that does not jump."""
+        """Times of these commands ``(N,)``, seconds of `time.monotonic`."""
         return np.load(io.BytesIO(request(f"{self.url}/times.npy")), allow_pickle=False)
 
     def failure(self) -> str:
@@ -130,10 +126,7 @@ class EmulatedCamera:
         request(f"{self._url}/state")
 
     def read(self) -> Frame:
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "observation.npz"
-            file.write_bytes(request(f"{self._url}/observation.npz"))
-            seen = Observation.load(file)
+        seen = _photograph(self._url)
         self._frames += 1
         return Frame(seen.rgb, seen.depth, seen.intrinsics, float(self._frames))
 
@@ -142,6 +135,10 @@ class EmulatedCamera:
 
     def disconnect(self) -> None:
         """Nothing to close."""
+
+
+def _photograph(url: str) -> Observation:
+    return Observation.read(io.BytesIO(request(f"{url}/observation.npz")), url)
 
 
 def request(url: str, data: bytes | None = None) -> bytes:

@@ -26,27 +26,13 @@ RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORTS, GRIPPER_PORT = 30004, 29999, (30001, 30
 RATE_HZ = 125.0
 VERSION = (5, 11, 0, 0)
 
-# Types of the variables that are not six doubles, by name or beginning of the name.
+# Types of the variables for which `ur_rtde` asks, by prefix, and their formats; all others are six doubles.
 TYPES = {
-    "DOUBLE": (
-        "timestamp", "speed_scaling", "target_speed_fraction", "actual_momentum", "actual_main_voltage",
-        "actual_robot_voltage", "actual_robot_current", "payload", "tool_output_current", "tool_temperature",
-        "standard_analog", "actual_execution_time", "tcp_force_scalar", "ft_raw_wrench_scalar", "io_current",
-        "euromap67", "tool_analog", "output_double", "input_double", "speed_slider_fraction",
-    ),
-    "UINT64": ("actual_digital", "actual_configurable_digital"),
-    "INT32": ("robot_mode", "safety_mode", "safety_status", "tool_output_voltage", "output_int", "input_int"),
-    "UINT32": (
-        "runtime_state", "robot_status_bits", "safety_status_bits", "analog_io_types", "tool_mode", "output_bit",
-        "input_bit", "speed_slider_mask",
-    ),
-    "UINT8": ("standard_digital_output", "configurable_digital_output", "standard_analog_output_mask",
-              "standard_analog_output_type", "tool_digital"),
-    "VECTOR6INT32": ("joint_mode",),
-    "VECTOR3D": ("actual_tool_accelerometer", "payload_cog", "elbow_position", "elbow_velocity"),
-}  # fmt: skip
-FORMATS = {"DOUBLE": "d", "UINT64": "Q", "INT32": "i", "UINT32": "I", "UINT8": "B", "VECTOR6INT32": "6i",
-           "VECTOR3D": "3d", "VECTOR6D": "6d"}  # fmt: skip
+    "DOUBLE": ("timestamp", "output_double", "input_double"),
+    "INT32": ("robot_mode", "output_int", "input_int"),
+    "UINT32": ("runtime_state", "robot_status_bits", "safety_status_bits"),
+}
+FORMATS = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "VECTOR6D": "6d"}
 
 # Commands of the script that `ur_rtde` uploads, in the first integer register.
 SERVO_J, SET_WATCHDOG, STOP_SCRIPT = 11, 35, 255
@@ -55,7 +41,7 @@ READY, DONE = 1, 2
 RUNNING, STOPPED = 2, 1  # runtime states
 NORMAL_BIT, PROTECTIVE_BIT = 0x01, 0x04  # of the safety status
 POWER_BIT, PROGRAM_BIT = 0x01, 0x02  # of the robot status
-# The emulation shares the processor with what uses it: times are longer than a controller's.
+# The emulation shares the processor with its client: times are longer than a controller's.
 SLACK = 100  # factor of the watchdog's time
 TIMEOUT_S, LATENCY_S = 0.9, 0.1  # of the gripper's answers; of states
 
@@ -70,7 +56,7 @@ class Controller:
         self._lock, self._start = threading.Lock(), time.monotonic()
         self._running, self._script_state, self._watchdog_s, self._heard = False, READY, 0.0, 0.0
         state = twin.state(index)
-        self._joints, self._goal, self._stamp = state.joints, state.joints, 0.0
+        self._joints, self._stamp = state.joints, 0.0
         self._gripper = {"ACT": 1, "GTO": 1, "STA": 3, "OBJ": 3, "FLT": 0, "SPE": 255, "FOR": 150,
                          "POS": 0, "PRE": 0}  # fmt: skip
         self._connections: set[socket.socket] = set()
@@ -165,15 +151,10 @@ class Controller:
         registers = dict(zip(names, values, strict=True))
         with self._lock:
             self._heard = time.monotonic()
-            if "input_int_register_0" not in registers:
+            command = registers.get("input_int_register_0")
+            if command is None or not self._running:
                 return
-            command = registers["input_int_register_0"]
-            if not self._running:
-                return
-            if command in CONTINUOUS or command == 0:
-                self._script_state = READY
-            else:
-                self._script_state = DONE
+            self._script_state = READY if command in CONTINUOUS or command == 0 else DONE
             if command == SET_WATCHDOG:
                 frequency = registers["input_double_register_0"]
                 self._watchdog_s = SLACK / frequency if frequency > 0 else 0.0
@@ -184,7 +165,6 @@ class Controller:
 
     def _move(self, joints: np.ndarray) -> None:
         state = self._twin.state(self._index)
-        self._goal = joints.copy()
         if self.fault("blocked"):
             joints[1] = state.joints[1]
         travel = (1 - self._gripper["PRE"] / 255) * self._travel
@@ -205,16 +185,11 @@ class Controller:
             values: dict[str, object] = {
                 "timestamp": [self._stamp],
                 "actual_q": np.full(6, np.nan) if self.fault("nan") else self._joints,
-                "target_q": self._goal,
                 "robot_mode": [7],
-                "safety_mode": [3 if protective else 1],
-                "safety_status": [3 if protective else 1],
                 "safety_status_bits": [PROTECTIVE_BIT if protective else NORMAL_BIT],
                 "robot_status_bits": [POWER_BIT | (PROGRAM_BIT if self._running else 0)],
                 "runtime_state": [RUNNING if self._running else STOPPED],
                 "output_int_register_0": [self._script_state],
-                "speed_scaling": [1.0],
-                "target_speed_fraction": [1.0],
             }
         return struct.pack(">" + kind, *values.get(name, [0] * count))  # type: ignore[misc]
 
@@ -234,14 +209,12 @@ class Controller:
     def _serve_dashboard(self, connection: socket.socket) -> None:
         connection.sendall(b"Connected: Universal Robots Dashboard Server\n")
         for line in connection.makefile("r"):
-            protective = self._protective()
             answers = {
                 "polyscopeversion": "URSoftware 5.11.0.108249 (Sep 24 2021)",
                 "get serial number": "20200000000",
                 "is in remote control": "true",
                 "robotmode": "Robotmode: RUNNING",
-                "safetystatus": f"Safetystatus: {'PROTECTIVE_STOP' if protective else 'NORMAL'}",
-                "safetymode": f"Safetymode: {'PROTECTIVE_STOP' if protective else 'NORMAL'}",
+                "safetystatus": f"Safetystatus: {'PROTECTIVE_STOP' if self._protective() else 'NORMAL'}",
                 "running": f"Program running: {str(self._running).lower()}",
                 "stop": "Stopped",
                 "quit": "Disconnected",

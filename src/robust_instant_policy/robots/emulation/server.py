@@ -9,35 +9,23 @@ from __future__ import annotations
 import io
 import json
 import sys
-import tempfile
-import threading
 import time
 from collections.abc import Mapping
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
-from typing import Protocol
+from functools import partial
+from http.server import BaseHTTPRequestHandler
 
 import numpy as np
 
 from robust_instant_policy.errors import CellError, RipError
+from robust_instant_policy.network import Answer, serve_loopback
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.emulation.controller import Controller
-from robust_instant_policy.robots.emulation.faults import FaultSwitch
 from robust_instant_policy.robots.emulation.servos import ServoBus
 from robust_instant_policy.robots.emulation.twin import SharedTwin, Twin
 from robust_instant_policy.robots.models import arm_of
 from robust_instant_policy.robots.priority import DEVICE, take_real_time
 
-
-class Device(Protocol):
-    """An emulated arm. ``options`` are those by which its driver finds it; ``limp`` whether it ever let go."""
-
-    fault: FaultSwitch
-    limp: bool
-
-    @property
-    def options(self) -> Mapping[str, str | float]: ...
-    def unplug(self) -> None: ...
+Device = ServoBus | Controller  # ``options``: by which the driver finds it; ``limp``: whether it ever let go
 
 
 def make_device(kind: str, twin: SharedTwin, index: int, finger_travel: float, pace: float) -> Device:
@@ -58,66 +46,44 @@ def serve(config: CellConfig, twin: Twin) -> None:
         )
         for index, one in enumerate(config.arms)
     }
-    server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(shared, devices))
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    print(
-        json.dumps(
-            {
-                "url": f"http://127.0.0.1:{server.server_address[1]}",
-                "devices": {name: dict(device.options) for name, device in devices.items()},
-            }
-        ),
-        flush=True,
-    )
+    url = serve_loopback(partial(_answer, shared, devices))
+    options = {name: dict(device.options) for name, device in devices.items()}
+    print(json.dumps({"url": url, "devices": options}), flush=True)
     sys.stdin.buffer.read()  # ends with the process that started this one
 
 
-def _handler(shared: SharedTwin, devices: Mapping[str, Device]) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            try:
-                if self.path == "/observation.npz":
-                    with tempfile.TemporaryDirectory() as folder:
-                        file = Path(folder) / "observation.npz"
-                        shared.photograph().save(file)
-                        self._send(200, file.read_bytes())
-                elif self.path in ("/commands.npy", "/times.npy"):
-                    buffer = io.BytesIO()
-                    np.save(buffer, shared.commands if self.path == "/commands.npy" else shared.times)
-                    self._send(200, buffer.getvalue())
-                elif self.path == "/state":
-                    limp = [name for name, device in devices.items() if device.limp]
-                    self._send(200, json.dumps({"failure": shared.failure(), "limp": limp}).encode())
-                else:
-                    self._send(404, b"not here")
-            except RipError as error:
-                self._send(409, str(error).encode())
+def _answer(shared: SharedTwin, devices: Mapping[str, Device], request: BaseHTTPRequestHandler) -> Answer:
+    serve = _look if request.command == "GET" else _change
+    try:
+        content = serve(shared, devices, request.path)
+    except RipError as error:
+        return 409, "text/plain", str(error).encode()
+    return (404, "text/plain", b"not here") if content is None else (200, "application/octet-stream", content)
 
-        def do_POST(self) -> None:
-            _, what, name, fault = (self.path.split("/") + [""] * 3)[:4]
-            if (what != "fault" or name not in devices) and (what != "scene" or not name.isdecimal()):
-                self._send(404, b"not here")
-                return
-            began = time.monotonic()
-            try:
-                if what == "scene":
-                    shared.reset(int(name))
-                elif fault == "unplugged":
-                    devices[name].unplug()
-                else:
-                    devices[name].fault.set(fault)
-                self._send(200, str(began).encode())
-            except RipError as error:
-                self._send(409, str(error).encode())
 
-        def _send(self, status: int, content: bytes) -> None:
-            self.send_response(status)
-            self.send_header("Content-Length", str(len(content)))
-            self.end_headers()
-            self.wfile.write(content)
+def _look(shared: SharedTwin, devices: Mapping[str, Device], path: str) -> bytes | None:
+    if path == "/observation.npz":
+        return shared.photograph().npz()
+    if path in ("/commands.npy", "/times.npy"):
+        buffer = io.BytesIO()
+        np.save(buffer, shared.commands if path == "/commands.npy" else shared.times)
+        return buffer.getvalue()
+    if path == "/state":
+        limp = [name for name, device in devices.items() if device.limp]
+        return json.dumps({"failure": shared.failure(), "limp": limp}).encode()
+    return None
 
-        def log_message(self, format: str, *arguments: object) -> None:
-            """Standard error stays free for errors."""
 
-    return Handler
+def _change(shared: SharedTwin, devices: Mapping[str, Device], path: str) -> bytes | None:
+    """Returns when the change began."""
+    _, what, name, fault = (path.split("/") + [""] * 3)[:4]
+    began = time.monotonic()
+    if what == "scene" and name.isdecimal():
+        shared.reset(int(name))
+    elif what != "fault" or name not in devices:
+        return None
+    elif fault == "unplugged":
+        devices[name].unplug()
+    else:
+        devices[name].fault.set(fault)
+    return str(began).encode()

@@ -30,11 +30,11 @@ from robust_instant_policy.robots.followers.viperx import (
 XM540, XM430 = 1120, 1020
 SMALL = (8, 9)  # IDs of the smaller servos
 REGISTERS = 1024
-PING, READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x08, 0x55, 0x82, 0x83
+PING, WRITE, STATUS, SYNC_READ, SYNC_WRITE = 0x01, 0x03, 0x55, 0x82, 0x83
 BROADCAST = 0xFE
 RANGE_ERROR, ACCESS_ERROR = 0x04, 0x07
 LOCKED_BELOW = 64  # registers of the EEPROM, which cannot be written with the torque on
-# The emulation shares the processor with what uses it: timeouts are twenty times those of real servos, the watchdog's
+# The emulation shares the processor with its client: timeouts are twenty times those of real servos, the watchdog's
 # a hundred times.
 EMULATED_TIMEOUT_MS, WATCHDOG_UNIT_S = 600.0, 2.0
 WATCHDOG_EXPIRED = 0xFF
@@ -60,8 +60,6 @@ class ServoBus:
             self._put(servo, dxl.DRIVE_MODE, int(servo in SHADOWS))
             self._put(servo, dxl.SHADOW_ID, SHADOWS.get(servo, 255))
             self._put(servo, dxl.OPERATING_MODE, 5 if servo == GRIPPER else 3)
-            self._put(servo, dxl.VOLTAGE, 120)
-            self._put(servo, dxl.TEMPERATURE, 35)
         self._measure()
         self._woken, self._wake = os.pipe()
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -107,26 +105,19 @@ class ServoBus:
         if instruction == PING:
             for servo in self._memory if target == BROADCAST else (target,):
                 self._reply(servo, bytes(self._memory[servo][:2]) + b"\x2d")
-        elif instruction == READ:
-            self._measure()
-            self._reply(target, bytes(self._memory[target][word : word + int.from_bytes(data[2:4], "little")]))
         elif instruction == SYNC_READ:
             self._measure()
             length = int.from_bytes(data[2:4], "little")
             for servo in data[4:]:
                 self._reply(servo, bytes(self._memory[servo][word : word + length]))
         elif instruction == WRITE:
-            error = self._write(target, word, data[2:])
-            self._reply(target, b"", error)
+            self._reply(target, b"", self._write(target, word, data[2:]))
         elif instruction == SYNC_WRITE:
             length = int.from_bytes(data[2:4], "little")
             for at in range(4, len(data), length + 1):
                 self._write(data[at], word, data[at + 1 : at + 1 + length])
             if word == dxl.GOAL_POSITION.address:
                 self._move()
-        elif instruction == REBOOT:
-            self._put(target, dxl.HARDWARE_ERROR, 0)
-            self._reply(target, b"")
 
     def _reply(self, servo: int, data: bytes, error: int = 0) -> None:
         if servo not in self._memory:
@@ -152,10 +143,8 @@ class ServoBus:
         if address == dxl.GOAL_POSITION.address and not 0 <= int.from_bytes(data, "little", signed=True) < dxl.TURN:
             return RANGE_ERROR
         self.limp |= address == dxl.TORQUE.address and torque == 1 and data[0] == 0
-        for one in (
-            servo,
-            *(shadow for shadow, first in SHADOWS.items() if first == servo and address >= LOCKED_BELOW),
-        ):
+        shadows = [shadow for shadow, first in SHADOWS.items() if first == servo and address >= LOCKED_BELOW]
+        for one in (servo, *shadows):
             self._memory[one][address : address + len(data)] = data
         return 0
 

@@ -79,9 +79,9 @@ class LaggingTwin:
 class SharedTwin:
     """A twin that the devices of several arms drive, each from its own thread.
 
-    The twin advances when every arm was told a command since its last step, or one arm was told a second one: time
-    passes as fast as commands come. ``commands`` keeps what was executed, ``(N, A, J + 1)``, ``times`` when, ``(N,)``
-    seconds of the machine's clock that does not jump.
+    The twin advances when each arm has got a command since its last step, or one arm has got a second one: time
+    passes as fast as commands come. ``commands (N, A, J + 1)`` are the executed ones, ``times (N,)`` their times,
+    seconds of `time.monotonic`.
     """
 
     def __init__(self, twin: Twin):

@@ -15,6 +15,7 @@ from robust_instant_policy.motion.arm import Arm
 from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots.cameras import made_by
 from robust_instant_policy.robots.cell import Section
+from robust_instant_policy.robots.device import answered, numbers
 
 GRIPPER_OPEN = 100.0  # of LeRobot's grippers, in percent
 TORQUE_OFF = "disable_torque_on_disconnect"  # key of LeRobot's configurations, True by default
@@ -78,16 +79,14 @@ class LeRobotFollower:
 
     def state(self) -> ArmState:
         seen = self._answer(self._device.get_observation)
-        missing = [key for key in (*self._keys, self._gripper) if key not in seen]
-        if missing:
-            raise RobotError(f"{self.name} has no {', '.join(missing)}; it has {', '.join(sorted(map(str, seen)))}")
+        *values, opening = numbers(self.name, seen, (*self._keys, self._gripper))
         now = time.monotonic()
-        joints = np.radians(self._signs * (np.array([float(seen[key]) for key in self._keys]) - self._offsets))
+        joints = np.radians(self._signs * (np.array(values) - self._offsets))
         speeds = np.zeros_like(joints)
         if self._before is not None and now > self._before[0]:
             speeds = (joints - self._before[1]) / (now - self._before[0])
         self._before = now, joints
-        return ArmState(joints, speeds, float(seen[self._gripper]) / GRIPPER_OPEN * self._travel, 0.0, now)
+        return ArmState(joints, speeds, opening / GRIPPER_OPEN * self._travel, 0.0, now)
 
     def command(self, command: Command) -> None:
         values = self._signs * np.degrees(command.joints) + self._offsets
@@ -103,9 +102,4 @@ class LeRobotFollower:
             self._answer(self._device.disconnect)
 
     def _answer(self, call: Callable[[], Any]) -> Any:
-        try:
-            return call()
-        except (OSError, RuntimeError, ValueError) as error:  # what LeRobot's devices raise
-            raise RobotError(
-                f"{self.name} does not answer: {error}; check its cable and its LeRobot calibration"
-            ) from error
+        return answered(self.name, call, "; check its cable and its LeRobot calibration")

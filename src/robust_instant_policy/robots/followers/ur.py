@@ -1,8 +1,8 @@
 """A UR5e (or another e-Series arm) through `ur_rtde`, with a Robotiq gripper on its own port.
 
 The library runs in a process of its own, see `robots.rtde`. It uploads a script to the controller and sends it targets
-over RTDE. The controller's own watchdog stops the script when no target arrives for 100 ms; its safety system stays in
-charge at all times.
+over RTDE. The controller's own watchdog stops the script when no target arrives for 100 ms; its safety system is always
+active.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ import contextlib
 import numpy as np
 
 from robust_instant_policy.errors import RobotError
-from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm
 from robust_instant_policy.motion.state import ArmState, Command
 from robust_instant_policy.robots import dynamixel as dxl
@@ -98,7 +97,9 @@ class ViperX:
         if not self._watched:
             self._bus.sync_write(ALL, dxl.BUS_WATCHDOG, [WATCHDOG] * len(ALL))
             self._watched = True
-        self._bus.sync_write(ALL, dxl.GOAL_POSITION, self._goal(command.joints, command.finger_travel))
+        gripper = self._closed + (self._open - self._closed) * command.finger_travel / self._travel
+        goals = dxl.to_position(np.append(command.joints, gripper))
+        self._bus.sync_write(ALL, dxl.GOAL_POSITION, goals.tolist())
 
     def stop(self) -> None:
         # The servos hold their last goal, one step ahead of where they are. Where something holds an arm back, its
@@ -113,10 +114,6 @@ class ViperX:
     def disconnect(self) -> None:
         self.stop()
         self._bus.close()
-
-    def _goal(self, joints: FloatArray, finger_travel: float) -> list[int]:
-        gripper = self._closed + (self._open - self._closed) * finger_travel / self._travel
-        return dxl.to_position(np.append(joints, gripper)).tolist()
 
     def _unwatch(self) -> None:
         """Switch the watchdog off, which also frees servos that it stopped."""

@@ -12,7 +12,7 @@ from robust_instant_policy.robots.cell import ArmConfig
 from robust_instant_policy.robots.leader import Leader
 from robust_instant_policy.robots.leaders.arm_leader import ArmLeader, JointSource
 from robust_instant_policy.robots.leaders.gamepad import GamepadSource
-from robust_instant_policy.robots.leaders.jog import JogLeader, KeyboardSource
+from robust_instant_policy.robots.leaders.jog import JogLeader, JogSource, KeyboardSource
 from robust_instant_policy.robots.leaders.joint_map import JointMap
 from robust_instant_policy.robots.leaders.lerobot_source import LeRobotSource
 from robust_instant_policy.robots.leaders.spacemouse import SpaceMouseSource
@@ -31,17 +31,14 @@ def make_leader(config: ArmConfig, arm: Arm, rate_hz: float, folder: Path, press
     if config.leader is None:
         raise CellError(f'{config.name} has no leader: give it a table, such as leader = {{ kind = "keyboard" }}')
     section, kind = config.leader.section(), config.leader.kind
-    if kind == "keyboard":
+    if kind in JOG_KINDS:
+        jog: JogSource = KeyboardSource(pressed)
+        if kind == "gamepad":
+            jog = GamepadSource(section.text("device", "/dev/input/js0"), rate_hz)
+        elif kind == "spacemouse":
+            jog = SpaceMouseSource(section.text("device", ""), rate_hz)
         section.finish()
-        return JogLeader(KeyboardSource(pressed), arm)
-    if kind == "gamepad":
-        device = section.text("device", "/dev/input/js0")
-        section.finish()
-        return JogLeader(GamepadSource(device, rate_hz), arm)
-    if kind == "spacemouse":
-        device = section.text("device", "")
-        section.finish()
-        return JogLeader(SpaceMouseSource(device, rate_hz), arm)
+        return JogLeader(jog, arm)
     source = joint_source(config)  # raises for an unknown kind, too
     file = section.text("calibration", "")
     return ArmLeader(source, _joint_map(kind, file, folder, config.name, len(arm.home)), arm.finger_travel)

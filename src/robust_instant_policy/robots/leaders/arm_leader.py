@@ -9,30 +9,25 @@ import numpy as np
 from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.state import ArmState, Command
+from robust_instant_policy.robots.device import Device
 from robust_instant_policy.robots.leaders.joint_map import JointMap
 
 MAX_STEP_RAD = 1.0  # between two readings; a servo that restarted jumps by more
 
 
-class JointSource(Protocol):
-    """A device with S angles. The methods raise `RobotError` when it does not answer."""
-
-    name: str
-
-    def connect(self) -> None: ...
+class JointSource(Device, Protocol):
+    """A device with S angles."""
 
     def angles(self) -> FloatArray:
         """Readings ``(S,)`` rad."""
         ...
 
-    def disconnect(self) -> None: ...
-
 
 class ArmLeader:
     """See `robots.leader.Leader`; ``finger_travel`` is the follower's, metres.
 
-    Servos count turns from where they are switched on. So whole turns are chosen at the first reading after `start`,
-    as near as possible to the follower's joints, and followed from there.
+    Servos count turns from the angle at power-on. So at the first reading after `start`, the number of whole turns that
+    is nearest to the follower's joints is chosen; later readings are unwrapped from there.
     """
 
     def __init__(self, source: JointSource, joints: JointMap, finger_travel: float):

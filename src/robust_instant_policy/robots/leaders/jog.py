@@ -11,18 +11,15 @@ from scipy.spatial.transform import Rotation
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.motion.arm import Arm
 from robust_instant_policy.motion.state import ArmState, Command, is_gripping
+from robust_instant_policy.robots.device import Device
 
 LEAD_M, LEAD_RAD = 0.03, 0.3  # by which the wanted tool pose may be ahead of the measured one
 JOG_SPEEDS = np.array([0.12] * 3 + [0.8] * 3)  # m/s and rad/s of axes that are pushed fully
 REACHED_M = 0.003  # a pose that the arm misses by more is not commanded
 
 
-class JogSource(Protocol):
-    """The methods raise `RobotError` when the device does not answer."""
-
-    name: str
-
-    def connect(self) -> None: ...
+class JogSource(Device, Protocol):
+    """A device that a person pushes or presses."""
 
     def start(self) -> None:
         """Forget what the person did before the arm follows."""
@@ -32,8 +29,6 @@ class JogSource(Protocol):
         """Since the last call: the wanted motion ``(6,)``, metres and rotation vector (rad) along the world's axes, and
         whether the gripper was told to open or close."""
         ...
-
-    def disconnect(self) -> None: ...
 
 
 class JogLeader:

@@ -6,16 +6,14 @@ q = sign · (reading - offset), for each joint, from the channel that belongs to
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robust_instant_policy.errors import CalibrationError
-from robust_instant_policy.files import write_whole
 from robust_instant_policy.geometry import FloatArray
-from robust_instant_policy.robots.calibration.toml import toml
+from robust_instant_policy.robots.calibration.toml import now, save_calibration
 from robust_instant_policy.robots.cell import read_section
 
 CLEAR_SHARE = 0.5  # of a shown turn that a channel must follow, and that no other one may reach
@@ -50,7 +48,7 @@ class JointMap:
     def save(self, path: Path) -> None:
         """Write the TOML file that `load` reads."""
         facts = {
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "date": now(),
             "channels": self.channels.tolist(),
             "signs": self.signs.tolist(),
             "offsets": np.round(self.offsets, 5).tolist(),
@@ -58,7 +56,7 @@ class JointMap:
             "gripper_open": round(self.gripper_open, 5),
             "gripper_closed": round(self.gripper_closed, 5),
         }
-        write_whole(path, (HEADER + toml(facts)).encode())
+        save_calibration(path, HEADER, facts)
 
     @classmethod
     def load(cls, path: Path) -> JointMap:

@@ -7,8 +7,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from robust_instant_policy.errors import RobotError
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.robots.device import answered, numbers
 
 
 class LeRobotShape(Protocol):
@@ -26,21 +26,11 @@ class LeRobotSource:
         self.name, self._device, self._keys, self._degrees = name, device, tuple(keys), degrees
 
     def connect(self) -> None:
-        self._answer(self._device.connect)
+        answered(self.name, self._device.connect)
 
     def angles(self) -> FloatArray:
-        action = self._answer(self._device.get_action)
-        missing = [key for key in self._keys if key not in action]
-        if missing:
-            raise RobotError(f"{self.name} has no {', '.join(missing)}; it has {', '.join(sorted(action))}")
-        angles = np.array([float(action[key]) for key in self._keys])
+        angles = np.array(numbers(self.name, answered(self.name, self._device.get_action), self._keys))
         return np.radians(angles) if self._degrees else angles
 
     def disconnect(self) -> None:
-        self._answer(self._device.disconnect)
-
-    def _answer(self, call):
-        try:
-            return call()
-        except (OSError, RuntimeError, ValueError) as error:  # what LeRobot's devices raise
-            raise RobotError(f"{self.name} does not answer: {error}") from error
+        answered(self.name, self._device.disconnect)

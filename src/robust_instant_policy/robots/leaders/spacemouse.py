@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robust_instant_policy.errors import MissingExtraError, RobotError
+from robust_instant_policy.errors import RobotError, needs_extra
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.robots.leaders.jog import JOG_SPEEDS
 
@@ -31,10 +31,8 @@ class SpaceMouseSource:
         self._device: Any = None
 
     def connect(self) -> None:
-        try:
+        with needs_extra("robots"):
             import pyspacemouse
-        except ImportError:
-            raise MissingExtraError("pyspacemouse", "robots") from None
         ros = pyspacemouse.AxisConvention.ROS
         try:
             if self._path:
@@ -47,7 +45,7 @@ class SpaceMouseSource:
 
     def start(self) -> None:
         self.step()
-        self._heard = -math.inf  # the last report may be old: the system keeps the first ones that nobody read
+        self._heard = -math.inf  # the last report may be old: the system buffers unread ones
 
     def step(self) -> tuple[FloatArray, bool]:
         presses = 0
