@@ -320,6 +320,22 @@ def test_of_two_alike_things_the_one_at_the_hand_is_the_grasped_one(first):
     assert not of_grasped.any()
 
 
+def test_a_thing_of_its_own_colour_is_not_taken_for_another_that_the_hand_grasps_instead():
+    """Which of two things the hand takes may depend on the scene: the nearer one, for instance."""
+    colours = [((200, 40, 50), (230, 230, 230)), ((30, 50, 160), (230, 230, 230))]
+    taken = [0, 0, 1, 0, 1, 1, 0]
+    scenes = [
+        [(x, y, 0.03, 0.05, own) for (x, y), own in zip(places(seed, 2), colours, strict=True)] for seed in range(7)
+    ]
+    images = [photograph(blocks) for blocks in scenes]
+    paths = [path_to(*blocks[number][:2]) for blocks, number in zip(scenes, taken, strict=True)]
+    extractor = KeypointExtractor(6, features="efficientnet").fit(images, paths)
+    assert not extractor.left_out_.any()
+    found = np.array([owners(*one) for one in zip(extractor.pixels_, images, scenes, strict=True)])
+    assert set(found[0]) == {0, 1}
+    assert (found == found[0]).all()
+
+
 @pytest.mark.parametrize(("demonstration", "kind"), [(3, "missing"), (2, "recoloured"), (0, "missing")])
 def test_a_demonstration_without_the_grasped_thing_is_left_out_and_told(demonstration, kind):
     scenes = [blocks_at(seed, halves=(0.04, 0.03)) for seed in range(6)]

@@ -150,6 +150,7 @@ def _aligned(
     """
     stretch = len(views) >= MIN_IMAGES_OF_KIND
     points = model.points
+    centre, radius = points.mean(axis=0, keepdims=True), float(np.sqrt(points.var(axis=0).sum()))
     near = _nearness(model, hands[0])
     options, priors = [np.eye(4)[None]], [np.zeros(1)]
     poses = [np.eye(4)[None]]
@@ -164,6 +165,10 @@ def _aligned(
         rivals = alternatives(model, one, view, by_hand)
         prior = (rivals.score - rivals.score.max()) / RIVAL_SCALE
         prior = prior - _hand_loss(rivals.motions, hands[0], hands[number], near)
+        if one.fitness > SAME_THING_FITNESS:  # a hand that takes another thing here tells nothing of this one
+            places = transform_points(rivals.motions, centre)[:, 0]
+            elsewhere = np.linalg.norm(places - transform_points(one.pose, centre), axis=1) > radius
+            prior[elsewhere & (rivals.fitness < SAME_THING_FITNESS)] = -np.inf
         kept = np.union1d(0, np.flatnonzero(prior > prior.max() - 2 * MAX_RIVAL_LOSS))
         poses.append(rivals.motions[kept])
         options.append(stretched(model, poses[-1], view) if stretch else poses[-1])
@@ -200,7 +205,8 @@ def _aligned(
     if near.max() > MIN_NEAR:
         pairs = zip(aligned, hands, strict=True)
         loss = np.array([_hand_loss(one.pose[None], hands[0], places, near)[0] for one, places in pairs])
-        gone = loss > GONE * MAX_HAND_LOSS * near.sum()
+        unlike = np.array([one.fitness < SAME_THING_FITNESS for one in aligned])
+        gone = unlike & (loss > GONE * MAX_HAND_LOSS * near.sum())
         if gone.mean() <= MAX_MISSING and np.median(loss) < HELD * MAX_HAND_LOSS * near.sum():
             aligned = [replace(one, fitness=0.0) if lost else one for one, lost in zip(aligned, gone, strict=True)]
     return aligned, replace(model, surroundings=agreed(range(len(views))))
