@@ -57,7 +57,7 @@ class Planned:
 def sampled(scenes: int) -> list[Sampled]:
     world = PickAndPlace()
     demos = [world.scene(seed) for seed in range(NUM_DEMOS)]
-    prompt = fitted(demos, "adaptive", "factorised", "given")
+    prompt = fitted(demos, "adaptive", "factorised")
     model = RecordedModel(connect("embedded"), SampleStore(STORE))
     result = []
     for number in range(scenes):

@@ -55,7 +55,10 @@ def missing(data: Path, scenes: int, table: Path) -> None:
                     lines.append(f"| {name} | {kind} | {index} | {error} | 0 of 10 | — | — |")
                     continue
                 sound = SimpleNamespace(
-                    locate=extractor.locate, pixels_=extractor.pixels_[others], keypoints_=extractor.keypoints_[others]
+                    locate=extractor.locate,
+                    pixels_=extractor.pixels_[others],
+                    keypoints_=extractor.keypoints_[others],
+                    left_out_=extractor.left_out_[others],
                 )
                 known = [images[i] for i in others], [truths[i] for i in others]
                 observed, photographs, real = zip(*new, strict=True)

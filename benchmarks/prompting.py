@@ -83,7 +83,7 @@ class Measurement:
         self._world = PickAndPlace(row.task)
         demos = [self._world.scene(seed) for seed in range(NUM_DEMOS)]
         self._prompt = fitted(demos, row.frames, row.layout)
-        self._paper = fitted(demos, "world", "sequence", "given")
+        self._paper = fitted(demos, "world", "sequence")
         self._cold = True
 
     def plan(self, number: int) -> Outcome:
@@ -129,7 +129,7 @@ class Measurement:
         """Tokens of a correct plan in the paper's layout, counted by this model."""
         (query,) = self._paper.queries(scene.keypoints)
         # With the truth as one more demonstration, the correct answer is the text after its keypoints.
-        told = fitted([scene], "world", "sequence", "given").queries(scene.keypoints)[0].text
+        told = fitted([scene], "world", "sequence").queries(scene.keypoints)[0].text
         keypoints = query.text.splitlines()[-1] + "\n"
         answer = told.removeprefix(keypoints).removesuffix(keypoints)
         read = query.text if self._cold else keypoints

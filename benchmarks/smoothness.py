@@ -9,7 +9,6 @@ the gripper's points over three successive steps.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from stored_proposals import NUM_DEMOS, arguments, proposals
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies import Context, LocatedScene, Proposal, Settings, aggregate
+from robust_instant_policy.policies.aggregation import agree
 from robust_instant_policy.reporting.tables import Table
 from robust_instant_policy.trajectory import Trajectory
 
@@ -32,11 +32,11 @@ def sharpest_turn(trajectory: Trajectory) -> float:
 
 def turns(context: Context, scene: LocatedScene, proposal: Proposal) -> tuple[list[float], float]:
     """Largest second differences for all but the first of `COLUMNS`, and the shift of key steps by known curvature."""
-    unknown = replace(context, prompt=replace(context.prompt, curvature=None))
-    mean, free, robust = (
-        aggregate(known, scene, proposal, Settings(estimator=estimator)).trajectory
-        for known, estimator in ((context, "mean"), (unknown, "em"), (context, "em"))
+    mean, robust = (
+        aggregate(context, scene, proposal, Settings(estimator=estimator)).trajectory for estimator in ("mean", "em")
     )
+    unknown = agree(proposal, Settings(), variation=context.prompt.for_scene(scene.keypoints).variation)
+    free = Trajectory(unknown.actions, unknown.times)
     paths = (proposal.candidates[0], mean, free, robust)
     return [sharpest_turn(path) for path in paths], key_error(robust, free)
 

@@ -12,7 +12,7 @@ from robust_instant_policy import Observation, Plan
 from robust_instant_policy.datasets.video import decode_video
 from robust_instant_policy.geometry import project
 from robust_instant_policy.reporting.charts import candidate_colour
-from robust_instant_policy.reporting.pictures import keypoint_colour, tool_points
+from robust_instant_policy.reporting.pictures import keypoint_colour
 
 HEIGHT = 360  # pixels
 EVERY = 2  # of the video's frames
@@ -28,7 +28,7 @@ def seen_and_proposed(folder: Path) -> Image.Image:
     draw = ImageDraw.Draw(image)
 
     def path(trajectory, colour, width):
-        pixels = (project(tool_points(trajectory, 0), observation.intrinsics, observation.camera_pose) + 0.5) * zoom
+        pixels = (project(trajectory.tool_points[:, 0], observation.intrinsics, observation.camera_pose) + 0.5) * zoom
         draw.line([tuple(pixel) for pixel in pixels], fill=colour, width=width, joint="curve")
 
     for index, candidate in enumerate(plan.candidates):

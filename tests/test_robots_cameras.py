@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import CellError, RobotError
+from robust_instant_policy.errors import CellError, RobotError, UsageError
 from robust_instant_policy.robots.calibration import Board
 from robust_instant_policy.robots.calibration.board_pose import reprojection_px
 from robust_instant_policy.robots.cameras import LeRobotCamera, RealSenseCamera, RecordedCamera, make_camera
@@ -225,7 +225,7 @@ def test_a_system_library_that_is_missing_is_named(monkeypatch, tmp_path):
     (tmp_path / "pyrealsense2.py").write_text("raise ImportError('libusb-1.0.so.0: cannot open shared object file')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pyrealsense2")
-    with pytest.raises(RobotError, match=r"libusb-1\.0\.so\.0.* apt install libusb-1.0-0"):
+    with pytest.raises(UsageError, match=r"libusb-1\.0\.so\.0.* apt install libusb-1.0-0"):
         sdk()
 
 

@@ -84,7 +84,7 @@ class CommandParser(argparse.ArgumentParser):
     """Its help tells the default of each option that has one."""
 
     def add_argument(self, *names: Any, **settings: Any) -> argparse.Action:
-        if settings.get("default") not in (None, argparse.SUPPRESS):
+        if settings.get("help") and settings.get("default") not in (None, "", argparse.SUPPRESS):
             settings["help"] += " (default: %(default)s)"
         return super().add_argument(*names, **settings)
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from tokenize import TokenError
 from types import MappingProxyType
 from typing import BinaryIO
 
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 
 from robust_instant_policy.checks import checked_array, checked_pose, checked_positive
 from robust_instant_policy.errors import DatasetError, InvalidValueError
-from robust_instant_policy.files import npz, open_regular, write_whole
+from robust_instant_policy.files import UNREADABLE_NPZ, npz, open_regular, write_whole
 from robust_instant_policy.geometry import FloatArray, as_numbers, lift
 from robust_instant_policy.trajectory import Trajectory
 
@@ -129,13 +127,6 @@ def _check_intrinsics(intrinsics: FloatArray, height: int, width: int) -> None:
             f"intrinsics (3, 3) put the principal point at ({cx:g}, {cy:g}) of an image of {width} x {height} pixels; "
             "are they another camera's, or of another resolution?"
         )
-
-
-# What zipfile, zlib and NumPy's header reader raise for content that is not theirs.
-UNREADABLE_NPZ = (
-    OSError, ValueError, EOFError, RuntimeError, MemoryError, SyntaxError, LookupError, TypeError, OverflowError,
-    zipfile.BadZipFile, zlib.error, TokenError,
-)  # fmt: skip
 
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> NDArray:

@@ -41,15 +41,18 @@ class MissingExtraError(RipError):
 @contextmanager
 def needs_extra(extra: str, library: str | None = None) -> Iterator[None]:
     """Raises `MissingExtraError` for a package that the ``with`` block imports and that is not installed, and
-    `RobotError` for one that is, but cannot be loaded without ``library``, a package of Debian."""
+    `UsageError` for one that is, but cannot be loaded, for instance without ``library``, a package of Debian."""
     try:
         yield
-    except ImportError as error:
-        if library is not None and not isinstance(error, ModuleNotFoundError):
-            raise RobotError(f"a system library is missing: {error}; on Debian: apt install {library}") from error
+    except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("robust_instant_policy"):
             raise
         raise MissingExtraError(error.name, extra) from error
+    except ImportError as error:
+        if (error.name or "").startswith("robust_instant_policy"):
+            raise
+        remedy = f"on Debian: apt install {library}" if library else f"try: {install_command(extra)}"
+        raise UsageError(f"a package that is installed cannot be loaded: {error}; {remedy}") from error
 
 
 def install_command(extra: str) -> str:

@@ -16,8 +16,10 @@ import shutil
 import stat
 import sys
 import zipfile
+import zlib
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -98,6 +100,13 @@ def _whole(digits: str) -> int:
     return int(digits)
 
 
+# What zipfile, zlib and NumPy's header reader raise for content that is not theirs.
+UNREADABLE_NPZ = (
+    OSError, ValueError, EOFError, RuntimeError, MemoryError, SyntaxError, LookupError, TypeError, OverflowError,
+    zipfile.BadZipFile, zlib.error, TokenError,
+)  # fmt: skip
+
+
 def npz(arrays: Mapping[str, object]) -> bytes:
     """The content of a compressed ``.npz`` file."""
     buffer = io.BytesIO()
@@ -115,7 +124,7 @@ def load_arrays(path: Path, names: Collection[str], advice: str) -> dict[str, ND
         return arrays
     except FileNotFoundError:
         raise DatasetError(f"{path} is missing; {advice}") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except (*UNREADABLE_NPZ, AttributeError) as error:
         raise DatasetError(f"{path} is damaged ({error}); {advice}") from None
 
 

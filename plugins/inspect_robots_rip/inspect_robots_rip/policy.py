@@ -31,7 +31,7 @@ class RipPolicy(PolicyBase):
         llm: str = "embedded",
         method: str = "rip",
         camera: str = "top",
-        min_confidence: float = 0.5,
+        min_confidence: float = 0.9,
     ):
         demonstrations = rip.load_demonstrations(demos)
         first = demonstrations[0]

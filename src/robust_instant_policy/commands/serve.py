@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_demos(parser)
     parser.add_argument("--method", choices=("rip", "neighbours"), default="rip", help="of planning")
     parser.add_argument(
-        "--min-confidence", type=share(0), default=0.5, metavar="P", help="plans with a lower confidence are refused"
+        "--min-confidence", type=share(0), default=0.9, metavar="P", help="plans with a lower confidence are refused"
     )
     parser.add_argument(
         "--host", default="127.0.0.1", help=f"address; one that others can reach needs a key in {KEY_VARIABLE}"

@@ -81,22 +81,25 @@ def measure(
 ) -> Accuracy:
     """Locate the keypoints of a fitted ``extractor`` in new ``scenes`` and compare them with the truth.
 
-    ``demonstrations`` are the images it was fitted to, ``known`` their truth, all as rendered; ``camera`` makes the
+    ``demonstrations`` are the images it was fitted to, ``known`` their truth, all as rendered; those that it left out
+    do not count. ``camera`` makes the
     extractor's image from a scene and its number. ``symmetries`` are, by name, the parts that look the same after each
     n-th of a turn about the vertical through their frame's origin.
     """
+    kept = np.flatnonzero(~extractor.left_out_).tolist()
+    shown, known = [demonstrations[i] for i in kept], [known[i] for i in kept]
     located = tuple(
         extractor.locate(scene if camera is None else camera(scene, number)) for number, scene in enumerate(scenes)
     )
     moving = _moving_parts([*known, *scenes_known])
-    part_of = tuple(_part_of(pixels, known, moving) for pixels in np.swapaxes(extractor.pixels_, 0, 1))
+    part_of = tuple(_part_of(pixels, known, moving) for pixels in np.swapaxes(extractor.pixels_[kept], 0, 1))
     found = np.array([image.keypoints for image in located])
     truth = np.full(found.shape, np.nan)
     for part in sorted({*part_of} - {""}):
         own = [k for k, name in enumerate(part_of) if name == part]
         symmetry = (symmetries or {}).get(part, 1)
-        places = _places(extractor.keypoints_[:, own], [_looks(_pose(scene, part), symmetry) for scene in known])
-        boxes = np.array([_extent(o, s, part) for o, s in zip(demonstrations, known, strict=True)])[:, :, None]
+        places = _places(extractor.keypoints_[kept][:, own], [_looks(_pose(scene, part), symmetry) for scene in known])
+        boxes = np.array([_extent(o, s, part) for o, s in zip(shown, known, strict=True)])[:, :, None]
         new_boxes = np.array([_extent(o, s, part) for o, s in zip(scenes, scenes_known, strict=True)])[:, :, None]
         sizes = np.diff(np.concatenate([boxes, new_boxes]), axis=1)
         if np.nanmax(np.nanmax(sizes, axis=0) - np.nanmin(sizes, axis=0)) < SAME_SIZE_M:

@@ -17,7 +17,7 @@ from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.depth import lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.matching import certainty, find_again, plausibility, register_all
-from robust_instant_policy.perception.models import MIN_FITNESS, Registration, RigidObject
+from robust_instant_policy.perception.models import MAX_MISSING, MIN_FITNESS, Registration, RigidObject
 from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.objects import find_objects, segmentation, without
@@ -170,6 +170,11 @@ class KeypointExtractor:
         missing = ~np.array([thing.shown[order] for thing in self.objects_])  # (O, I)
         missing[np.array(counts) == 0] = False
         self.left_out_: NDArray[np.bool_] = np.asarray(missing.any(axis=0))
+        if self.left_out_.mean() > MAX_MISSING:
+            raise KeypointError(
+                f"{self.left_out_.sum()} of {len(views)} demonstrations lack one of the objects with keypoints; "
+                "record them with all objects in view"
+            )
         for number, i in np.argwhere(missing):
             notes.append(
                 f"demonstration {i} is left out: object {number}, which has keypoints, is missing there, hidden, or of "

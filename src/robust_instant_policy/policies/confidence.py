@@ -36,8 +36,9 @@ WORDS = {
     "displacement": "around the planned gripper the image shows what lies {displacement_mm:.0f} mm beside it in the "
     "demonstrations (theirs differ by {precision_mm:.0f} mm)",
     "doubts": "gripper states, grasps or rotations seem to be recorded wrongly",
+    "agreement": "the candidates agree to within 15 mm with a probability of {agreement:.2f} only",
 }
-"""What each feature says."""
+"""What each feature says, and the agreement."""
 
 RECOGNISED = 0.7  # of the least confidence in demonstrations, from which on a scene counts as recognised
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
@@ -94,7 +95,9 @@ class Evidence:
             "displacement_mm": 1e3 * self.displacement,
             "precision_mm": 1e3 * self.precision,
         }
-        told = "; ".join(WORDS[name].format(**values) for name, value in self.features().items() if value < 0)
+        lowering = [name for name, value in self.features().items() if value < 0]
+        lowering += ["agreement"] if self.agreement < GOOD_AGREEMENT else []
+        told = "; ".join(WORDS[name].format(**values) for name in lowering)
         lowered = (f"warning: the confidence is lowered: {told}",) if told else ()
         return (*lowered, *(() if self.is_known else (UNKNOWN_NOTE,)))
 

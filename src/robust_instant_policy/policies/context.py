@@ -123,8 +123,8 @@ def _context(
     demonstrations: Sequence[Demonstration] = (),
     extractor: KeypointExtractor | OwnKeypoints | None = None,
 ) -> Context:
-    """Thin the ``trajectories`` out and serialise them; with their ``observations`` and all ``demonstrations`` where
-    there is more than these.
+    """Thin the ``trajectories`` out and serialise them with their ``keypoints``. ``observations`` are the images of
+    these; ``demonstrations`` are all, also those that were left out.
     """
     thinned = tuple(downsample(one, settings.downsampling, settings.num_steps) for one in trajectories)
     prompt = write_prompt(keypoints, thinned, settings.frames, settings.layout)

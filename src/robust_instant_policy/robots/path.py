@@ -46,7 +46,8 @@ class Sweep:
     @classmethod
     def load(cls, path: Path) -> Sweep:
         """Raises `DatasetError` for a file that is not the sweep of a motion."""
-        return cls(**load_arrays(path, ("tools", "links", "seconds"), ADVICE))
+        arrays = load_arrays(path, ("tools", "links", "seconds"), ADVICE)
+        return cls(arrays["tools"], arrays["links"], arrays["seconds"])
 
 
 def tool_points(joints: FloatArray, arms: Sequence[Arm]) -> FloatArray:
@@ -76,7 +77,7 @@ class MeasuredPath:
     def load(cls, path: Path) -> MeasuredPath:
         """Raises `DatasetError` for a file that is not a measured path."""
         arrays = load_arrays(path, ARRAYS, ADVICE)
-        return cls(float(arrays.pop("rate_hz")), **arrays)
+        return cls(float(arrays["rate_hz"]), *(arrays[name] for name in ARRAYS[1:]))
 
     @property
     def joint_errors(self) -> FloatArray:
