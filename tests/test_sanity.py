@@ -154,6 +154,20 @@ def test_demonstrations_whose_geometry_is_wrong_are_refused_and_the_mistake_is_n
         check_demonstrations(FAULTS[fault].demonstrations(demonstrations[:3])).raise_if_wrong()
 
 
+def test_a_rod_that_colour_shows_too_is_no_error_of_the_depth(demonstrations):
+    first = demonstrations[0].observation
+    depth, rgb = first.depth.copy(), first.rgb.copy()
+    rows = slice(depth.shape[0] // 2, depth.shape[0] // 2 + depth.shape[0] // 16)
+    depth[rows] *= 0.5
+    alone = replace(demonstrations[0], observation=replace(first, depth=depth))
+    assert "check the depth stream" in told(check_demonstrations([alone, *demonstrations[1:]]).findings)
+    rgb[rows] = (20, 25, 30)
+    seen = replace(demonstrations[0], observation=replace(first, depth=depth, rgb=rgb))
+    found = check_demonstrations([seen, *demonstrations[1:]]).findings
+    assert "depth stream" not in told(found)
+    assert any("something hides the whole of rows" in one.message for one in found)
+
+
 def test_wrong_readings_below_the_table_are_no_hole_for_paths_that_lie_too_low(demonstrations):
     rng, low = np.random.default_rng(0), []
     for one in demonstrations:

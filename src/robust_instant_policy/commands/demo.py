@@ -99,7 +99,7 @@ def _tell(plan: Plan, screen: StageConsole) -> None:
 
 
 def _demonstrations(task: Task, wanted: str, screen: StageConsole) -> list[Demonstration]:
-    if not wanted.isdigit():
+    if not wanted.isdecimal():
         with screen.stage(f"demonstrations from {wanted}"):
             return load_demonstrations(wanted, task=task.name)
     thrown_away = 0

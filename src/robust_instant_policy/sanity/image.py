@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.pointcloud import MILLIMETRES_ABOVE
@@ -20,6 +21,7 @@ GREY = 2  # of 255: largest difference of the channels in a grey image with nois
 SQUARE_PIXELS = 0.1  # relative difference of fx and fy that no camera has
 CENTRED = 0.2  # of the image's size that the principal point may lie from its middle
 BAND_M, BAND_ON_TABLE, BAND_ROWS = 0.03, 0.02, 3  # height off the table, share of a row still on it, rows of the grid
+SEEN = 12.0  # of 255: difference of the colour of a band from what is beside it, from which on it is a thing
 HOLE_M = 0.012  # from a point to the nearest depth reading, from which on what is there was not measured
 WIDE_M, WIDER = 0.015, 1.5  # the same of a hole that may hide a thing, and so many times the demonstrations' holes
 NEAR_TABLE_M = 0.05  # height of fingertips over the table below which they work
@@ -45,11 +47,18 @@ def check_image(view: View) -> list[Finding]:
     if readings < MIN_READINGS:
         words = f"{readings:.0%} of the depth image has a steady reading; check the camera's depth stream"
         return [*found, Finding("depth", "error", words, {"readings": readings})]
-    for lines, what in ((view.height, "rows"), (view.height.T, "columns")):
+    for lines, colours, what in (
+        (view.height, view.rgb, "rows"),
+        (view.height.T, np.swapaxes(view.rgb, 0, 1), "columns"),
+    ):
         if band := _band(lines):
             first, last = (edge * view.every for edge in band)
-            words = f"depth is off over the whole of {what} {first} to {last}, and right beside them"
             numbers = {"first": float(first), "last": float(last)}
+            if _in_colour(colours, *band):
+                words = f"something hides the whole of {what} {first} to {last} from the camera; move it away"
+                found.append(Finding("hole", "warning", words, numbers, "hidden"))
+                continue
+            words = f"depth is off over the whole of {what} {first} to {last}, and right beside them"
             return [*found, Finding("depth", "error", f"{words}; check the depth stream", numbers, f"a band of {what}")]
     raw = observation.depth[np.isfinite(observation.depth) & (observation.depth > 0)]
     if (median := float(np.median(raw))) > MILLIMETRES_ABOVE:
@@ -123,6 +132,14 @@ def _band(height: FloatArray) -> tuple[int, int] | None:
         return None
     off = off[(off > inner[0]) & (off < inner[-1])]
     return (int(off[0]), int(off[-1])) if len(off) >= BAND_ROWS else None
+
+
+def _in_colour(rgb: NDArray[np.float32], first: int, last: int) -> bool:
+    """Whether ``rgb (h, w, 3)`` shows a band from row ``first`` to ``last``, too: a thing, no error of depth."""
+    width = last - first + 1
+    beside = np.concatenate([rgb[max(first - width, 0) : first], rgb[last + 1 : last + 1 + width]])
+    apart = np.abs(rgb[first : last + 1].mean(axis=0) - beside.mean(axis=0)).max(axis=-1)
+    return bool(np.median(apart) > SEEN)
 
 
 def check_each_image(views: Sequence[View]) -> list[Finding]:

@@ -179,9 +179,9 @@ def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
         if not (unlike or apart or below or c.buried > max(BURIED_M, deep)):
             continue
         words = (
-            f"demonstration {index} contradicts the others: its path comes within {c.path * 1e3:.0f} mm of a surface, "
-            f"its lowest fingertip is {c.lowest * 1e3:.0f} mm above the table, and it is {likeness[index]:.2f} like "
-            f"the others ({usual:.2f}); look at it, and remove it if it is wrong"
+            f"demonstration {index} contradicts the others: its path comes no nearer than {c.path * 1e3:.0f} mm to a "
+            f"surface, its lowest fingertip is {c.lowest * 1e3:.0f} mm above the table, and it is "
+            f"{likeness[index]:.2f} like the others ({usual:.2f}); look at it, and remove it if it is wrong"
         )
         severity: Severity = "error" if apart or (below and likeness[index] < ALIKE) else "warning"
         numbers = {"demonstration": float(index), "path_gap": c.path, "likeness": float(likeness[index])}
