@@ -81,7 +81,7 @@ def test_a_path_template_stays_inside_the_folder_and_holds_the_known_fields_only
 def test_only_regular_files_of_the_folder_are_opened(kind, file):
     with damaged_folder(recorded_files(), f"{kind} {file}\n".encode()) as folder:
         message = refusal(lambda: [list(one.frames()) for one in load_demonstrations(folder)])
-        said = {"outside": "cp -rL", "device": "outside of itself", "loop": "cannot be"}
+        said = {"outside": "cp -rL", "device": "outside of itself", "loop": "cannot "}  # be followed, or read
         if not (kind == "loop" and file.startswith("meta/")):  # such a link is not there at all
             assert said.get(kind, "not a regular file") in message
 
