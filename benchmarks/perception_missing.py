@@ -7,9 +7,10 @@ other colours.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,29 +48,28 @@ def missing(data: Path, scenes: int, table: Path) -> None:
             for kind in KINDS:
                 seen = [one.observation for one in shown]
                 seen[index] = changed(seen[index], truths[index], part, kind)
-                others = [i for i in range(DEMONSTRATIONS) if i != index]
                 extractor = KeypointExtractor(features="efficientnet", workspace=task.workspace)
                 try:
                     extractor.fit(seen, [one.trajectory for one in shown])
                 except KeypointError as error:
                     lines.append(f"| {name} | {kind} | {index} | {error} | 0 of 10 | — | — |")
                     continue
-                sound = SimpleNamespace(
-                    locate=extractor.locate,
-                    pixels_=extractor.pixels_[others],
-                    keypoints_=extractor.keypoints_[others],
-                    left_out_=extractor.left_out_[others],
-                )
-                known = [images[i] for i in others], [truths[i] for i in others]
+                left_out = ", ".join(map(str, np.flatnonzero(extractor.left_out_))) or "none"
+                extractor.left_out_[index] = True  # its image is not that of its truth any more
                 observed, photographs, real = zip(*new, strict=True)
-                found = measure(sound, *known, photographs, real, lambda _, i, seen=observed: seen[i], SYMMETRIES)
+                camera = partial(_observed, observed)
+                found = measure(extractor, images, truths, photographs, real, camera, SYMMETRIES)
                 on = np.array([own == part for own in found.part_of])
                 errors = found.errors[:, on]
-                left_out = ", ".join(map(str, np.flatnonzero(extractor.left_out_))) or "none"
                 result = f"{(errors < RIGHT_M).mean():.0%} | {np.median(errors) * 1e3:.1f} mm" if on.any() else "— | —"
                 lines.append(f"| {name} | {kind} | {index} | {left_out} | {on.sum()} of {len(on)} | {result} |")
                 print(lines[-1], flush=True)
     table.write_text("\n".join(lines) + "\n")
+
+
+def _observed(scenes: Sequence[Observation], _: Observation, number: int) -> Observation:
+    """The noisy image of a scene."""
+    return scenes[number]
 
 
 def _known(task, seed: int) -> tuple[Observation, SceneTruth]:

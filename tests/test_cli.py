@@ -225,6 +225,15 @@ def test_a_ctrl_c_that_python_drops_ends_the_command_before_its_next_stage_motio
     assert stop.reason == "Ctrl-C"
 
 
+@pytest.mark.parametrize("out", ["folder", "file/plan.json"])
+@pytest.mark.parametrize("command", ["plan --observation none.npz", "check", "keypoints"])
+def test_an_output_that_cannot_be_written_is_told_before_any_work(command, out, tmp_path, capsys):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    assert main([*command.split(), "--demos", "nowhere", "--out", str(tmp_path / out)]) == 1
+    assert "is a f" in capsys.readouterr().err
+
+
 def test_a_plan_is_made_from_files_alone(workbench, tmp_path, capsys):
     out = tmp_path / "plan.json"
     command = ["plan", "--demos", str(workbench / "data/push-cube"), "--queries", "3"]

@@ -203,6 +203,16 @@ def require_replaceable(path: Path) -> None:
     _require_regular(path, mode)
 
 
+def require_writable(path: Path) -> None:
+    """Raises `DatasetError` where the file ``path`` could not be written: to call before long work. Creates nothing."""
+    require_replaceable(path)
+    folder = next(one for one in path.absolute().parents if one.exists())
+    if not folder.is_dir():
+        raise DatasetError(f"{folder} is a file, not a folder; choose another folder")
+    if not os.access(folder, os.W_OK):
+        raise DatasetError(f"{folder} is not writable; choose another folder")
+
+
 def make_folder(path: Path) -> None:
     """Create ``path`` and its parents, durably. Raises `DatasetError`."""
     if path.is_dir():

@@ -8,7 +8,7 @@ from pathlib import Path
 from robust_instant_policy.commands.options import add_demos, beside
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.files import write_whole
+from robust_instant_policy.files import require_writable, write_whole
 from robust_instant_policy.reporting.check import check_page
 from robust_instant_policy.sanity import Finding, check_demonstrations, errors
 
@@ -21,6 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print every finding and write the page; returns 1 if a finding is an error."""
+    out = options.out or beside(options.demos, "-check.html")
+    if options.out is not None:
+        require_writable(out)
     observation = None if options.observation is None else Observation.load(options.observation)
     demonstrations = load_demonstrations(options.demos)
     report = check_demonstrations(demonstrations)
@@ -30,7 +33,6 @@ def run(options: argparse.Namespace) -> int:
     _tell(report.findings, "demonstrations")
     if observation is not None:
         _tell(found, f"observation {options.observation}")
-    out = options.out or beside(options.demos, "-check.html")
     write_whole(out, check_page(f"Check of {name}", demonstrations, report, observation, found).encode())
     print(f"page: {out}")
     return 1 if errors((*report.findings, *found)) else 0

@@ -16,7 +16,7 @@ from robust_instant_policy.datasets import VideoWriter, load_demonstrations
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import UnreachableError, UsageError
 from robust_instant_policy.evaluation import Variant, holds_results, obtain_demonstrations, scene_seed
-from robust_instant_policy.files import file_stem
+from robust_instant_policy.files import file_stem, require_writable
 from robust_instant_policy.llm import check_server, model_name
 from robust_instant_policy.policies import Plan
 from robust_instant_policy.reporting.run import PLAN_FILE, SEEN_FILE, VIDEO_FILE, RunRecord, save_context, write_report
@@ -39,6 +39,7 @@ def run(options: argparse.Namespace) -> int:
     out = options.out or RUNS / f"{file_stem(options.task)}-{options.seed}"
     if holds_results(out):
         raise UsageError(f"{out} holds an evaluation; choose another folder with --out")
+    require_writable(out / PLAN_FILE)
     screen, scene = StageConsole(), scene_seed(options.seed, 0)
     screen.say(f"{options.task}: demonstrations, then a plan and its execution in a new scene (seed {scene})")
     check_server(options.llm)
@@ -54,7 +55,6 @@ def run(options: argparse.Namespace) -> int:
             with screen.stage("plan"):
                 plan = policy.plan(observation)
         _tell(plan, screen)
-        out.mkdir(parents=True, exist_ok=True)
         plan.save(out / PLAN_FILE)
         observation.save(out / SEEN_FILE)
         save_context(out, [one.observation.rgb for one in shown], policy.context_.pixels)

@@ -16,7 +16,7 @@ from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.evaluation import scene_seed
-from robust_instant_policy.files import write_whole
+from robust_instant_policy.files import require_writable, write_whole
 from robust_instant_policy.perception import KeypointExtractor
 from robust_instant_policy.perception.accuracy import Accuracy, measure
 from robust_instant_policy.reporting.keypoints import keypoints_page
@@ -46,6 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the page; for a simulated task also compare the keypoints of new scenes with the true positions of the same
     material points."""
+    if options.out is not None:
+        require_writable(options.out)
     screen = StageConsole()
     demonstrations = load_demonstrations(options.demos)
     camera: Camera = CameraNoise().photograph if options.noise else lambda seen, _: seen

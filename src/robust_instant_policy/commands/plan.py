@@ -10,6 +10,7 @@ from robust_instant_policy.commands.options import add_demos, add_method, add_re
 from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import load_demonstrations
 from robust_instant_policy.demonstration import Observation
+from robust_instant_policy.files import require_writable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    require_writable(options.out)
     screen = StageConsole()
     observation = Observation.load(options.observation)
     demonstrations = load_demonstrations(options.demos)

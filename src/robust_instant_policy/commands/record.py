@@ -9,7 +9,7 @@ from pathlib import Path
 from robust_instant_policy.commands.console import StageConsole
 from robust_instant_policy.commands.options import add_assets, add_level, positive, seed
 from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
-from robust_instant_policy.sanity import check_demonstrations
+from robust_instant_policy.sanity import check_demonstrations, errors
 from robust_instant_policy.tasks import make_task
 from robust_instant_policy.tasks.record import record
 
@@ -53,6 +53,7 @@ def run(options: argparse.Namespace) -> int:
     screen.say(
         f"{options.out}: {options.episodes} demonstrations of {task.name}, {thrown_away} failed attempts discarded"
     )
-    for finding in check_demonstrations(load_demonstrations(options.out)).findings:
+    findings = check_demonstrations(load_demonstrations(options.out)).findings
+    for finding in findings:
         screen.say(f"    {finding}")
-    return 0
+    return 1 if errors(findings) else 0

@@ -82,9 +82,8 @@ def measure(
     """Locate the keypoints of a fitted ``extractor`` in new ``scenes`` and compare them with the truth.
 
     ``demonstrations`` are the images it was fitted to, ``known`` their truth, all as rendered; those that it left out
-    do not count. ``camera`` makes the
-    extractor's image from a scene and its number. ``symmetries`` are, by name, the parts that look the same after each
-    n-th of a turn about the vertical through their frame's origin.
+    do not count. ``camera`` makes the extractor's image from a scene and its number. ``symmetries`` are, by name, the
+    parts that look the same after each n-th of a turn about the vertical through their frame's origin.
     """
     kept = np.flatnonzero(~extractor.left_out_).tolist()
     shown, known = [demonstrations[i] for i in kept], [known[i] for i in kept]

@@ -310,9 +310,9 @@ def _complete(
     model, registrations = models[number], [row[number] for row in found]
     templates = list(model.templates)
     for i in sorted(range(1, len(views)), key=lambda i: -registrations[i].score):
-        rank = [(k in handled and one.fitness > SAME_THING_FITNESS, one.score) for k, one in enumerate(found[i])]
         if number in handled and not registrations[i].fitness:
             continue
+        rank = [(k in handled and one.fitness > SAME_THING_FITNESS, one.score) for k, one in enumerate(found[i])]
         better = [k for k in range(len(models)) if rank[k] > rank[number]]
         taken = explained(models, found[i], better)
         start = registrations[i].pose[None]
