@@ -23,6 +23,7 @@ from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.regression import (
     StudentTMixture,
     StudentTNetwork,
+    StudentTNumbers,
     StudentTRegression,
     diagnose,
     robust_gripper_trajectory,
@@ -81,8 +82,7 @@ def step_errors(trajectory: FloatArray, truth: FloatArray) -> FloatArray:
 
 METHODS: dict[str, Method] = {
     "t, EM": lambda c, t: StudentTRegression(groups=POINTS).fit(c).mean(t),
-    "t, EM, by number": lambda c, t: StudentTRegression(unit="number").fit(c).mean(t),
-    "t, EM, by trajectory": lambda c, t: StudentTRegression(unit="trajectory", groups=POINTS).fit(c).mean(t),
+    "t, EM, by number": lambda c, t: StudentTNumbers().fit(c).mean(t),
     "t-mixture": lambda c, t: StudentTMixture(groups=POINTS).fit(c).mean(t),
     "mean": lambda c, t: np.mean(resampled(c, t), axis=0),
     "median": lambda c, t: np.median(resampled(c, t), axis=0),
