@@ -43,6 +43,14 @@ def choose_network(features: str | DescriptorNetwork, settings: DescriptorSettin
     return VitDescriptors(checkpoint, replace(settings, model=source)), note
 
 
+def require_features(features: str) -> None:
+    """Raises `ModelError` for a text that names no descriptors; to call before long work."""
+    if features not in ("auto", "dino", "efficientnet"):
+        from robust_instant_policy.perception.vit_checkpoint import require_source
+
+        require_source(features)
+
+
 def resolve_features(features: str, model: str = DescriptorSettings.model) -> str:
     """``features``, with ``"auto"`` replaced by what `choose_network` takes for it with the settings' ``model``."""
     if features != "auto":

@@ -36,7 +36,7 @@ class _FindingsError(RipError):
 
     def __init__(self, findings: Iterable[Finding]):
         self.findings = tuple(findings)
-        super().__init__("; ".join(finding.message for finding in self.findings))
+        super().__init__("; ".join(finding.message for finding in self.findings).replace("?; ", "? "))
 
 
 class GeometryError(_FindingsError):
