@@ -1,7 +1,5 @@
 """`rip demo`: record demonstrations, plan in a new scene, execute, and write a run folder with a report."""
 
-from __future__ import annotations
-
 import argparse
 from contextlib import ExitStack, closing
 from dataclasses import replace

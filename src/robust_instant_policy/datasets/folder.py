@@ -4,8 +4,6 @@ A folder may come from an unknown source, so its content is checked when it is r
 ``meta/info.json`` and ``meta/episodes``, and that all paths stay inside the folder.
 """
 
-from __future__ import annotations
-
 import math
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence

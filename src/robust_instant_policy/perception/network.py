@@ -1,7 +1,5 @@
 """Choice of the network that describes images."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Vision transformers of `transformers`, from the hub, a folder or a safetensors file. Only tensors are read."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import os

@@ -1,7 +1,5 @@
 """A robust trajectory for a gripper: rigid at every step, with a state that is open or closed and does not chatter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

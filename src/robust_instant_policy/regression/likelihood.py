@@ -12,8 +12,6 @@ Each of the three updates of an iteration maximises its expected value, so that 
 out `FAINT_PRICE`, where that applies.)
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

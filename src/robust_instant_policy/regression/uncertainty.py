@@ -1,7 +1,5 @@
 """How far the robust trajectory may be from the truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

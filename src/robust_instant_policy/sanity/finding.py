@@ -1,7 +1,5 @@
 """What a check found out, and the errors that it becomes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """What one RGB-D image with its camera says about itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`check_demonstrations`: everything that a set of demonstrations says about itself, about new scenes and plans."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

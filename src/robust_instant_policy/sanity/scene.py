@@ -1,7 +1,5 @@
 """A new scene against what the demonstrations' images have in common."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robust_instant_policy.demonstration import Observation
