@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Record missing demonstrations, plan and execute; writes the run folder."""
-    if options.demos.lstrip("-").isdecimal() and int(options.demos) < 1:
+    if options.demos.removeprefix("-").isdecimal() and int(options.demos) < 1:
         raise UsageError(f"--demos {options.demos}: the task must be shown at least once")
     if not options.demos.isdecimal():
         open_folder(Path(options.demos), options.task)  # raises before the simulator starts
