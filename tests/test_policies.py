@@ -277,8 +277,3 @@ def test_keypoints_that_slip_on_a_rigid_thing_are_measured():
     new[:2] += 0.03
     assert distortion(scenes, new) > 3
     assert np.isnan(distortion(scenes[:2], new))
-
-
-def test_a_robust_policy_takes_over_the_settings_of_keypoint_action_tokens():
-    instant = KeypointActionTokens(Imitator(), temperature=0.5)
-    assert RobustInstantPolicy(instant, num_queries=3).settings == Settings(temperature=0.5, num_queries=3)
