@@ -1,6 +1,6 @@
 """Writes results/summary.md, the averages of Table I in all of its runs: python scripts/summarise_results.py
 
-Run it after `rip report` of a folder, and `scripts/include_results.py` after it, which copies the table into the README.
+Run it after `rip report` of a folder; then `scripts/include_results.py` copies the table into the README.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def described(name: str, summary: Summary) -> str:
     counts = {len({row.scene for row in summary.rows if row.scene.task == task}) for task in summary.tasks}
     scenes = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
     of_sets = f"{sets} sets" if sets > 1 else "one set"
-    return f"{name}: {of_sets} of demonstrations, {scenes} new scenes a task and set"
+    return f"{name}: {of_sets} of demonstrations, new scenes a task and set: {scenes}"
 
 
 def table(summaries: Sequence[Summary]) -> Table:
@@ -75,8 +75,8 @@ def table(summaries: Sequence[Summary]) -> Table:
         if method in met
     ]
     note = (
-        "Success in percent, mean over ten tasks; in parentheses Wilson's 95% interval with one trial a task and set of "
-        "demonstrations. RIP is significantly better than what is marked \\* or \\*\\* (sign-flip test over scenes, "
+        "Success in percent, mean over ten tasks; in parentheses Wilson's 95% interval with one trial a task and set "
+        "of demonstrations. RIP is significantly better than what is marked \\* or \\*\\* (sign-flip test over scenes, "
         "Holm's correction within the column, p < 0.05 and p < 0.005). "
         f"{'; '.join(described(*one) for one in columns.items())}. "
         "The paper had GPT-4o, and physical robots for its ALOHA tasks."
