@@ -1,7 +1,5 @@
 """`rip doctor`: check what this machine needs for `rip`, and say how to install what is missing."""
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import os
@@ -31,7 +29,7 @@ EXTRAS = {
     "studio": ("viser",),
 }
 RENDERERS = (  # name, package of the simulator, extra, family of tasks, what must be installed
-    ("ManiSkill", "mani_skill", "sim", "maniskill", "mesa-vulkan-drivers, Mesa 23.1 or newer"),
+    ("ManiSkill", "mani_skill", "sim", "maniskill", "mesa-vulkan-drivers, Mesa 25 or newer"),
     ("MuJoCo", "mujoco", "aloha", "aloha", "libegl1 and libgl1-mesa-dri, or libosmesa6"),
 )
 

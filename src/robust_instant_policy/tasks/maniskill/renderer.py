@@ -1,7 +1,5 @@
 """Test whether SAPIEN can render. ``python -m`` this module tests it in a separate process."""
 
-from __future__ import annotations
-
 import sys
 
 import sapien.render
@@ -19,7 +17,7 @@ def require_renderer() -> str:
     except RuntimeError as error:
         raise RendererError(
             f"the simulator's camera has no renderer ({error}); run: make setup "
-            "(or install mesa-vulkan-drivers 23.1 or newer)"
+            "(or install mesa-vulkan-drivers 25 or newer)"
         ) from error
     finally:
         sapien.render.set_log_level("warn")
