@@ -28,6 +28,7 @@ from robust_instant_policy.geometry import FloatArray, robust_std, rotations_abo
 
 RIGID_SPREADS = 3.5  # keypoints whose distance varies by so many times the smallest variation belong to the same thing,
 RIGID_SPREAD_M = (0.006, 0.015)  # within these limits
+OUTLIER_SCATTERS = 4.0  # median distance of keypoints from their places in a thing; one so far off is an outlier
 DEMOS_FOR_MEDIANS = 5  # with fewer, an outlier cannot be identified
 SHAPE_TOLERANCE = 0.15  # of a thing's size: how far its shape may vary beside its size
 LEAST_SWING_RAD = 0.2  # a part that turns less than this shows no hinge
@@ -93,8 +94,8 @@ def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray, tolerance: 
     for kind, size in kinds:
         for group in groups:
             if len(group) >= size:
-                shape, mirrors = _mean_shape(keypoints[:, list(group)], kind == "upright", tolerance)
-                things.append(Thing(kind, group, shape, mirrors=mirrors))
+                shape, mirrors, outlier = _mean_shape(keypoints[:, list(group)], kind == "upright", tolerance)
+                things.append(Thing(kind, group, shape, mirrors=mirrors, outlier=outlier))
     return things
 
 
@@ -207,8 +208,9 @@ def spread(values: FloatArray) -> FloatArray:
     return robust_std(values)
 
 
-def _mean_shape(points: FloatArray, upright: bool, tolerance: float) -> tuple[FloatArray, bool]:
-    """The centred shape ``(N, 3)`` of which ``points (I, N, 3)`` are noisy, moved copies, and whether it ``mirrors``.
+def _mean_shape(points: FloatArray, upright: bool, tolerance: float) -> tuple[FloatArray, bool, float]:
+    """The centred shape ``(N, 3)`` of which ``points (I, N, 3)`` are noisy, moved copies, whether it ``mirrors``, and
+    how far off, metres, an outlier is.
 
     A reflection keeps all distances, but no motion leads to it: the fit is then off by more than ``tolerance``, metres.
     """
@@ -217,11 +219,14 @@ def _mean_shape(points: FloatArray, upright: bool, tolerance: float) -> tuple[Fl
     shape = points[typical] - points[typical].mean(axis=0)
     _, _, off = fit_either_hand(shape, points, upright, mirrors=True)
     mirrored = (off[0] > tolerance) & (off[1] < off[0] / 2)
-    mirrors = mirrored.sum() >= MIRRORED_DEMOS
+    mirrors = bool(mirrored.sum() >= MIRRORED_DEMOS)
+    outlier = OUTLIER_M
     for _ in range(2):
-        poses, hand, _ = fit_either_hand(shape, points, upright, mirrors)
+        poses, hand, _ = fit_either_hand(shape, points, upright, mirrors, outlier)
         back = (points - poses[:, None, :3, 3]) @ poses[:, :3, :3]
         back[..., 1] *= hand[:, None]
         shape = np.median(back, axis=0)
+        off = np.linalg.norm(back - shape, axis=-1)
+        outlier = max(OUTLIER_M, OUTLIER_SCATTERS * float(np.median(off)))
         shape = shape - shape.mean(axis=0)
-    return shape, bool(mirrors)
+    return shape, mirrors, outlier
