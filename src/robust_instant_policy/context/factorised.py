@@ -15,6 +15,7 @@ from robust_instant_policy.context.codec import MM, read_rows, row_grammar, row_
 from robust_instant_policy.context.frames import Frame, runs
 from robust_instant_policy.context.prompt import INSTRUCTION, REACH_MM, Prompt
 from robust_instant_policy.context.step_frames import StepFrames
+from robust_instant_policy.context.things import WORLD
 from robust_instant_policy.context.ways import Split
 from robust_instant_policy.geometry import FloatArray, fit_rigid
 from robust_instant_policy.query import Query
@@ -164,9 +165,10 @@ def make_questions(
     frames: StepFrames, inputs: FloatArray, offsets: FloatArray, key_steps: Sequence[int]
 ) -> tuple[Question, ...]:
     """What to ask of demonstrations with keypoints ``inputs (I, T, A, 3·K)`` and ``offsets (I, T, 7·A)`` from their
-    median in ``frames``: the numbers that vary, and that inputs predict better than the median does."""
+    median in ``frames``: the numbers that vary, and, where frames follow things, that inputs predict better than the
+    median does."""
     varies = _varies(offsets)
-    if len(offsets) >= MIN_DEMOS_TO_AGREE:
+    if len(offsets) >= MIN_DEMOS_TO_AGREE and any(frame.things != (WORLD,) for frame in frames.used):
         for arm in range(frames.num_arms):
             own = [HAND_DIM * arm + dim for dim in range(HAND_STATE)]
             for step in np.flatnonzero(varies[:, own].any(axis=1)):
