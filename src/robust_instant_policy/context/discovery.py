@@ -26,9 +26,10 @@ from robust_instant_policy.context.things import (
 )
 from robust_instant_policy.geometry import FloatArray, robust_std, rotations_about_vertical
 
-RIGID_SPREADS = 3.5  # keypoints whose distance varies by so many times the smallest variation belong to the same thing,
+RIGID_SPREADS = 3.0  # keypoints whose distance varies by so many times the smallest variation belong to the same thing,
 RIGID_SPREAD_M = (0.006, 0.015)  # within these limits
 OUTLIER_SCATTERS = 4.0  # median distance of keypoints from their places in a thing; one so far off is an outlier
+BIWEIGHT_REACH = 9.0  # median deviations up to which a value counts
 DEMOS_FOR_MEDIANS = 5  # with fewer, an outlier cannot be identified
 SHAPE_TOLERANCE = 0.15  # of a thing's size: how far its shape may vary beside its size
 LEAST_SWING_RAD = 0.2  # a part that turns less than this shows no hinge
@@ -58,7 +59,7 @@ def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
         nodes = to_tree(tree, rd=True)[1]
         groups = [tuple(sorted(node.pre_order())) for node in nodes if not node.is_leaf()]
         return [*_solid(groups, keypoints, RIGID_SPREAD_M[1]), *(Thing("point", (k,)) for k in range(num_points))]
-    varies = spread(distances)
+    varies = _scatter(distances)
     least = np.median(np.where(np.eye(num_points, dtype=bool), np.inf, varies).min(axis=1))
     tolerance = float(np.clip(RIGID_SPREADS * least, *RIGID_SPREAD_M))
     clusters = _clusters(varies, tolerance)
@@ -73,8 +74,16 @@ def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
 
 
 def _clusters(varies: FloatArray, tolerance: float) -> list[tuple[int, ...]]:
-    """Groups of keypoints all of whose distances vary less than ``tolerance``."""
+    """Groups of keypoints all of whose distances vary less than ``tolerance``.
+
+    A keypoint near a hinge may be of either part: it is counted to that to which its distances vary least.
+    """
     labels = fcluster(linkage(squareform(varies, checks=False), "complete"), tolerance, "distance")
+    for _ in range(2):
+        member = labels[:, None] == np.unique(labels)  # (K, groups)
+        several = member.sum(axis=0) > 1
+        apart = np.where(several, varies**2 @ member / np.maximum(member.sum(axis=0) - member, 1), np.inf)
+        labels = np.where((member & several).any(axis=1), np.unique(labels)[apart.argmin(axis=1)], labels)
     return [tuple(map(int, np.flatnonzero(labels == label))) for label in np.unique(labels)]
 
 
@@ -206,6 +215,18 @@ def spread(values: FloatArray) -> FloatArray:
     if len(values) < DEMOS_FOR_MEDIANS:
         return values.std(axis=0)
     return robust_std(values)
+
+
+def _scatter(distances: FloatArray) -> FloatArray:
+    """The same for distances that are noisy alone, of which it makes better use: the biweight (Mosteller and Tukey
+    1977)."""
+    if len(distances) < DEMOS_FOR_MEDIANS:
+        return distances.std(axis=0)
+    off = distances - np.median(distances, axis=0)
+    u = off / np.maximum(BIWEIGHT_REACH * np.median(np.abs(off), axis=0), 1e-9)
+    near = np.maximum(1 - u**2, 0)
+    slope = (near * (1 - 5 * u**2)).sum(axis=0)
+    return np.asarray(np.sqrt(len(distances) * (near**4 * off**2).sum(axis=0)) / np.abs(slope))
 
 
 def _mean_shape(points: FloatArray, upright: bool, tolerance: float) -> tuple[FloatArray, bool, float]:
