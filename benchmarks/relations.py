@@ -151,7 +151,7 @@ class Set:
     def __init__(self, family: Family, split: str, number: int, noise_mm: float, num_demos: int):
         self._draw = family.scenes(split, number, noise_mm / 1000)
         shown = [self._draw(index) for index in range(num_demos)]
-        self._keypoints = np.stack([scene.keypoints for scene in shown])
+        self.keypoints = np.stack([scene.keypoints for scene in shown])
         self._paths = [scene.path for scene in shown]
         self._contexts: dict[str, tuple[Context, float]] = {}
         self._fitted: dict[str, tuple[KeypointPolicy, float]] = {}
@@ -163,7 +163,7 @@ class Set:
         """The context, and the seconds that it took."""
         if settings.frames not in self._contexts:
             start = time.perf_counter()
-            context = context_of_keypoints(self._keypoints, self._paths, settings)
+            context = context_of_keypoints(self.keypoints, self._paths, settings)
             self._contexts[settings.frames] = context, time.perf_counter() - start
         return self._contexts[settings.frames]
 
