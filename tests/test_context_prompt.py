@@ -300,7 +300,8 @@ def test_numbers_are_asked_that_keypoints_predict_but_neither_frames_nor_chance(
         actions[23, [2, 5, 8]] += 0.3 * keypoints[index, 0, 1]
         trajectories[index] = Trajectory.from_actions(actions)
     asked = {place for question in write_prompt(keypoints, trajectories).questions for place in question.asked}
-    assert asked == {(23, 2)}
+    assert (23, 2) in asked
+    assert {dim for _, dim in asked} == {2}  # the displacement along x is random
     everything = write_prompt(keypoints[:2], trajectories[:2], "world")
     assert {dim for question in everything.questions for _, dim in question.asked} == set(range(6))
 

@@ -22,7 +22,6 @@ from robust_instant_policy.query import Query
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 MIN_DEMOS_TO_AGREE = 3
-LEFT_OVER = 0.8  # of a number's variance, with others' demonstrations as its guide, below which its inputs predict it
 RIDGE_MM = 20.0  # standard deviation of an input below which it explains little
 INPUTS_PER_QUERY = 2  # keypoint coordinates shown with each example
 NOISE_MM = 5.0  # variation of a keypoint coordinate that carries no information
@@ -191,7 +190,8 @@ def _varies(offsets: FloatArray) -> NDArray[np.bool_]:
 
 
 def predictable(inputs: FloatArray, outputs: FloatArray) -> NDArray[np.bool_]:
-    """Which of the numbers ``outputs (I, D)`` the keypoint coordinates ``inputs (I, 3·K)`` explain, all in millimetres.
+    """Which of the numbers ``outputs (I, D)`` the keypoint coordinates ``inputs (I, 3·K)`` predict better than the mean
+    of the demonstrations does, all in millimetres.
 
     Each demonstration is predicted from the others alone, by ridge regression on those of the inputs that a query would
     show. The rest is noise, which a model would only imitate.
@@ -206,7 +206,7 @@ def predictable(inputs: FloatArray, outputs: FloatArray) -> NDArray[np.bool_]:
         slope = np.linalg.solve(gram, x[others].T @ (outputs[others] - mean))
         missed[:, demo] = outputs[demo] - mean, outputs[demo] - mean - x[demo] @ slope
     usual, own = (missed**2).sum(axis=1)
-    return np.asarray(own < LEFT_OVER * usual)
+    return np.asarray(own < usual)
 
 
 def _blocks(frames: Sequence[Frame], key_steps: Sequence[int], offsets: FloatArray) -> list[list[int]]:
