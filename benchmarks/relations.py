@@ -428,11 +428,10 @@ def draw_reliability(rows: Sequence[Row], path: Path) -> None:
             if inside.any():
                 share, count = right[inside].mean(), int(inside.sum())
                 least, most = wilson_interval(int(right[inside].sum()), count)
+                below, above = max(share - least, 0.0), max(most - share, 0.0)  # rounding
                 at = confidence[inside].mean()
                 label = method if low == 0 or not (confidence < low).any() else None
-                axes.errorbar(
-                    at, share, [[share - least], [most - share]], fmt="os"[number % 2], color=f"C{number}", label=label
-                )
+                axes.errorbar(at, share, [[below], [above]], fmt="os"[number % 2], color=f"C{number}", label=label)
                 axes.annotate(f" {count}", (at, share), fontsize=8)
     axes.set(xlabel="confidence", ylabel="share of right plans", xlim=(-0.02, 1.06), ylim=(-0.02, 1.02))
     axes.legend(fontsize=8)
