@@ -9,8 +9,6 @@ docs/trust.md). A plan that breaks a check has confidence 0; where demonstration
 new scene, it is multiplied by `UNKNOWN`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
