@@ -241,7 +241,11 @@ def fit(options: argparse.Namespace) -> None:
     known = [
         row
         for row in judged_rows
-        if row[0].is_known and not row[0].errors and row[0].agreement >= GOOD_AGREEMENT and not row[0].doubled > 0
+        if row[0].is_known
+        and not row[0].errors
+        and row[0].agreement >= GOOD_AGREEMENT
+        and not row[0].doubled > 0
+        and not row[0].carried > 0
     ]
     names = [name for name in COEFFICIENTS if name != "constant"]
     found = [evidence.features() for evidence, *_ in known]

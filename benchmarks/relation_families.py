@@ -120,12 +120,16 @@ class Family:
     draw: Draw
     uncovered: tuple[str, ...] = UNCOVERED
 
+    def stream(self, split: str, set_number: int) -> list[int]:
+        """Seed of what a set's scenes share."""
+        return [zlib.crc32(split.encode()), zlib.crc32(self.name.encode()), set_number]
+
     def scenes(self, split: str, set_number: int, noise_m: float) -> Callable[..., Scene]:
         """Draws the scenes of a set of demonstrations: ``draw(number, exact=False, condition=USUAL)``.
 
         ``exact`` removes the demonstrator's errors; keypoints stay noisy. Splits share no random number.
         """
-        stream = [zlib.crc32(split.encode()), zlib.crc32(self.name.encode()), set_number]
+        stream = self.stream(split, set_number)
         kit = Kit(np.random.default_rng(stream))
 
         def draw(number: int, *, exact: bool = False, condition: str = USUAL) -> Scene:

@@ -151,7 +151,7 @@ class Set:
     def __init__(self, family: Family, split: str, number: int, noise_mm: float, num_demos: int):
         self._draw = family.scenes(split, number, noise_mm / 1000)
         shown = [self._draw(index) for index in range(num_demos)]
-        self._keypoints = np.stack([scene.keypoints for scene in shown])
+        self.keypoints = np.stack([scene.keypoints for scene in shown])
         self._paths = [scene.path for scene in shown]
         self._contexts: dict[str, tuple[Context, float]] = {}
         self._fitted: dict[str, tuple[KeypointPolicy, float]] = {}
@@ -163,7 +163,7 @@ class Set:
         """The context, and the seconds that it took."""
         if settings.frames not in self._contexts:
             start = time.perf_counter()
-            context = context_of_keypoints(self._keypoints, self._paths, settings)
+            context = context_of_keypoints(self.keypoints, self._paths, settings)
             self._contexts[settings.frames] = context, time.perf_counter() - start
         return self._contexts[settings.frames]
 
@@ -430,11 +430,10 @@ def draw_reliability(rows: Sequence[Row], path: Path) -> None:
             if inside.any():
                 share, count = right[inside].mean(), int(inside.sum())
                 least, most = wilson_interval(int(right[inside].sum()), count)
+                below, above = max(share - least, 0.0), max(most - share, 0.0)  # rounding
                 at = confidence[inside].mean()
                 label = method if low == 0 or not (confidence < low).any() else None
-                axes.errorbar(
-                    at, share, [[share - least], [most - share]], fmt="os"[number % 2], color=f"C{number}", label=label
-                )
+                axes.errorbar(at, share, [[below], [above]], fmt="os"[number % 2], color=f"C{number}", label=label)
                 axes.annotate(f" {count}", (at, share), fontsize=8)
     axes.set(xlabel="confidence", ylabel="share of right plans", xlim=(-0.02, 1.06), ylim=(-0.02, 1.02))
     axes.legend(fontsize=8)

@@ -14,6 +14,8 @@ from robust_instant_policy.context.discovery import find_things
 from robust_instant_policy.context.things import locate
 from robust_instant_policy.context.ways import find_ranking
 from robust_instant_policy.policies import Neighbours, context_of_keypoints, scene_of_keypoints
+from robust_instant_policy.policies.aggregation import take_first
+from robust_instant_policy.policies.sampling import Proposal
 from robust_instant_policy.trajectory import Trajectory
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -89,6 +91,20 @@ def test_demonstrations_that_do_different_things_are_told_apart(family, number):
 def test_along_each_axis_the_origin_is_that_of_one_thing_with_the_point_in_it(number):
     keypoints, trajectories, draw = shown("row", number=number)
     assert (errors(write_prompt(keypoints, trajectories), draw) < WITHIN_M).all()
+
+
+def test_a_place_beyond_a_line_is_on_the_points_between_which_the_line_runs():
+    right = []
+    for number in range(3):
+        keypoints, trajectories, draw = shown("spacing", number=number)
+        right += list(errors(write_prompt(keypoints, trajectories), draw) < WITHIN_M)
+    assert np.mean(right) > 0.8
+
+
+def test_a_keypoint_near_a_hinge_belongs_to_the_part_whose_distances_vary_least():
+    keypoints, _, _ = shown("door", number=2)
+    solid = [thing.members for thing in find_things(keypoints, hinges=False) if thing.kind == "upright"]
+    assert solid == [(0, 1, 2, 3, 4), (5, 6, 7, 8, 9)]
 
 
 def by_axis(grasp, release) -> Family:
@@ -244,6 +260,32 @@ def test_a_scene_that_stretches_what_was_shown_is_outside():
     assert prompt.outside(far) > 0.5
     assert prompt.scene_notes(keypoints[0]) == ()
     assert any("extrapolation" in note for note in prompt.scene_notes(far))
+
+
+def test_where_things_are_farther_apart_a_plan_passes_less_surely_and_a_fault_is_still_refused():
+    keypoints, trajectories, draw = shown("place")
+    policy = Neighbours()
+    policy.fit_context(context_of_keypoints(keypoints, trajectories, policy.settings))
+    carried = 0
+    for number in range(1000, 1012):
+        far = draw(number, exact=True, condition="twice as far")
+        scene = scene_of_keypoints(far.keypoints)
+        plan = policy.plan_scene(scene)
+        if not plan.evidence["carried"]:  # within what was demonstrated, or much too far
+            continue
+        carried += 1
+        assert key_error(plan.trajectory, far.path) < WITHIN_M
+        assert 0.5 < plan.confidence < 0.9
+        for fault in (np.add, np.multiply):
+            actions = plan.trajectory.actions.copy()
+            jump = [0, 3, 6] if fault is np.add else list(range(9))
+            actions[15:20, jump] = fault(actions[15:20, jump], 0.4 if fault is np.add else 2.0)
+            wrong = take_first(policy.context_, scene, Proposal((Trajectory.from_actions(actions),)))
+            assert any(note.startswith("error: ") for note in wrong.notes)
+    assert carried > 2
+    elsewhere = draw(1000, exact=True).keypoints + np.array([1.0, 0.0, 0.0])
+    plan = policy.plan_scene(scene_of_keypoints(elsewhere))
+    assert plan.confidence == 0  # a metre away no frame supports a plan
 
 
 def test_changes_of_frame_side_by_side_correct_a_jump_once():

@@ -14,7 +14,7 @@ from robust_instant_policy.context.frames import Anchor, Axes, Frame
 from robust_instant_policy.context.step_frames import StepFrames
 from robust_instant_policy.context.things import WORLD, locate, robust_fit
 from robust_instant_policy.errors import InvalidValueError
-from robust_instant_policy.geometry import GripperTriangle, make_pose
+from robust_instant_policy.geometry import GripperTriangle, fit_upright, invert_pose, make_pose
 from robust_instant_policy.trajectory import Trajectory
 
 TRIANGLE = GripperTriangle(length=0.1, opening=0.08)
@@ -250,6 +250,28 @@ def test_a_pose_is_fitted_to_the_majority_of_points():
         assert np.allclose(robust_fit(SHAPES[0], points[None], upright)[0], pose, atol=2e-3)
 
 
+def test_a_pose_is_fitted_to_noisy_points_nearly_as_well_as_by_least_squares():
+    rng = np.random.default_rng(0)
+
+    def scenes(count: int) -> tuple[np.ndarray, np.ndarray]:
+        angles, places = rng.uniform(-3, 3, count), rng.uniform(-0.2, 0.2, (count, 1, 3))
+        poses = make_pose(np.stack([turned(angle) for angle in angles]), places[:, 0])
+        points = SHAPES[0] @ np.swapaxes(poses[:, :3, :3], 1, 2) + places
+        return poses, points + rng.normal(0, 0.004, points.shape)
+
+    def off(poses: np.ndarray, true: np.ndarray) -> float:
+        """Mean scatter, metres, of a point 10 cm away."""
+        point = (invert_pose(true) @ poses @ [0.1, 0.0, 0.0, 1.0])[:, :3]
+        return float(np.linalg.norm(point - point.mean(axis=0), axis=1).mean())
+
+    (thing, *_) = find_things(scenes(10)[1])
+    assert thing.members == (0, 1, 2, 3, 4)
+    true, points = scenes(100)
+    found = locate([thing], points)[thing]
+    best = fit_upright(np.broadcast_to(SHAPES[0], points.shape), points, np.ones(points.shape[:2]))
+    assert off(make_pose(found.rotation, found.position), true) < 1.2 * off(best, true)
+
+
 def test_moving_the_whole_scene_moves_the_plan_with_it_except_where_the_world_counts():
     keypoints, trajectories = demonstrations()
     prompt = write_prompt(keypoints, trajectories)
@@ -268,16 +290,18 @@ def test_moving_the_whole_scene_moves_the_plan_with_it_except_where_the_world_co
     assert kinds == {True, False}
 
 
-def test_what_the_frames_predict_is_not_asked_and_what_differs_is():
-    keypoints, trajectories = demonstrations()
+def test_numbers_are_asked_that_keypoints_predict_but_neither_frames_nor_chance():
+    keypoints, trajectories = demonstrations(10)
     assert not write_prompt(keypoints, trajectories).questions
     rng = np.random.default_rng(0)
     for index, trajectory in enumerate(trajectories):
         actions = trajectory.actions.copy()
-        actions[23, :9] += np.tile(rng.normal(0, 0.01, 3), 3)
+        actions[23, [0, 3, 6]] += rng.normal(0, 0.01)
+        actions[23, [2, 5, 8]] += 0.3 * keypoints[index, 0, 1]
         trajectories[index] = Trajectory.from_actions(actions)
     asked = {place for question in write_prompt(keypoints, trajectories).questions for place in question.asked}
-    assert asked == {(23, 0), (23, 1), (23, 2)}
+    assert (23, 2) in asked
+    assert {dim for _, dim in asked} == {2}  # the displacement along x is random
     everything = write_prompt(keypoints[:2], trajectories[:2], "world")
     assert {dim for question in everything.questions for _, dim in question.asked} == set(range(6))
 

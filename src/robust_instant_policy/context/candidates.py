@@ -39,13 +39,19 @@ class Origin:
 
     It lies at a point of one of the ``ends``, or on the way between two or three of them, and moves with the size of
     the things in ``growing``. With ``by_axis`` its share of the way differs along each of the frame's axes. Where these
-    ``shares (3,)`` are known, the points in both ends count by them along each axis.
+    ``shares (3,)`` are known, the points in both ends count by them along each axis. ``points (3,)`` in the ends are
+    known where they are those between which a line was fitted.
     """
 
     ends: tuple[Thing, ...]
     growing: tuple[Thing, ...] = ()
     by_axis: bool = False
     shares: FloatArray | None = None
+    points: tuple[FloatArray, ...] = ()
+
+    def on(self, line: Axes) -> Origin:
+        """The same between the points of the ``line``."""
+        return replace(self, points=tuple(end.offset for end in line.ends if end.thing in self.ends))
 
     @property
     def weights(self) -> tuple[FloatArray, ...]:
@@ -117,22 +123,26 @@ class Candidates:
         deviations = np.array(
             [SHARE_STD] * 6 + [POINT_STD_M] * 9 + [OFFSET_STD_M] * 3 + [GROWTH_STD_M] * (3 * len(self.growing))
         )
-        start = np.stack([places[origin.ends[0]] for origin in self.origins])
-        design = np.zeros((len(rotation), len(self.origins), rotation.shape[1], 3, len(deviations)))
+        start = np.zeros((len(self.origins), rotation.shape[1], 3))
+        design = np.zeros((len(rotation), *start.shape, len(deviations)))
         sizes = [(scene[thing].size - 1)[:, None, None] * rotation for thing in self.growing]
         design[..., OFFSET.start :] = np.concatenate([rotation, *sizes], axis=-1)[:, None]
         for index, origin in enumerate(self.origins):
             own = design[:, index]  # (M, I, 3, P)
+            ends = [places[end] for end in origin.ends]
+            if origin.points:
+                ends = [scene[end].point(point) for end, point in zip(origin.ends, origin.points, strict=True)]
+            start[index] = ends[0]
             if not origin.growing:
                 own[..., GROWTH] = 0.0
             for number, (end, weight) in enumerate(zip(origin.ends, origin.weights, strict=True)):
-                if end.turns:
+                if end.turns and not origin.points:
                     turned = scene[end].rotation
                     if origin.shares is not None:
                         turned = (rotation * weight) @ np.swapaxes(rotation, -1, -2) @ turned
                     own[..., POINTS.start + 3 * number :][..., :3] = turned
                 if number:
-                    away = (places[end] - start[index])[..., None]
+                    away = (ends[number] - ends[0])[..., None]
                     if origin.by_axis:
                         away = rotation * (np.swapaxes(rotation, -1, -2) @ away).swapaxes(-1, -2)
                     own[..., 3 * (number - 1) :][..., : away.shape[-1]] = away

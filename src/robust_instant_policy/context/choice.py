@@ -88,23 +88,37 @@ def _with_weighted_points(candidates: Candidates, errors: Errors, hands: ShownHa
 
 
 def _with_fitted_lines(candidates: Candidates, errors: Errors, hands: ShownHands) -> Candidates:
-    """``candidates`` with those lines fitted that suit some step best."""
+    """``candidates`` with those lines fitted that suit some step best, and origins at or between the lines' ends."""
     picks = _best(errors)
-    axes = list(candidates.axes)
+    axes, origins = list(candidates.axes), list(candidates.origins)
     for index in np.unique(picks[:, 0]):
-        if len(axes[index].ends) == 2:
-            steps = np.flatnonzero(picks[:, 0] == index)
-            own = replace(hands, points=hands.points[:, steps])
-            axes[index] = _fitted_line(candidates, axes[index], own, picks[steps, 1])
-    return replace(candidates, axes=tuple(axes))
+        line = axes[index]
+        if len(line.ends) == 1:
+            continue
+        steps = np.flatnonzero(picks[:, 0] == index)
+        own = replace(hands, points=hands.points[:, steps])
+        axes[index] = _fitted_line(candidates, line, own, [candidates.origins[n] for n in picks[steps, 1]])
+        things = [end.thing for end in line.ends]
+        if WORLD not in things:
+            near = [n for n, origin in enumerate(candidates.origins) if set(origin.ends) <= set(things)]
+            best = errors.cost[steps, index][:, near].argmin(axis=1)
+            used = [candidates.origins[near[number]] for number in best]
+            axes.append(_fitted_line(candidates, line, own, used, tied=True))
+            origins += [origin.on(axes[-1]) for origin in dict.fromkeys(used)]
+    return replace(candidates, axes=tuple(axes), origins=tuple(origins))
 
 
-def _fitted_line(candidates: Candidates, axes: Axes, hands: ShownHands, origins: IntArray) -> Axes:
-    """``axes`` with the ends between which the line predicts the ``hands`` best, each step's origin being one of
-    ``origins (T,)``; by robust least squares, with the other numbers eliminated."""
+def _fitted_line(
+    candidates: Candidates, axes: Axes, hands: ShownHands, picks: Sequence[Origin], tied: bool = False
+) -> Axes:
+    """``axes`` with the ends between which the line predicts the ``hands`` best, T ``picks`` being the steps' origins;
+    by robust least squares, with the other numbers eliminated. Where they are ``tied``, origins are on the line's ends.
+    """
     free = [end.thing.turns or end.thing is WORLD for end in axes.ends]
     width = 3 if axes.in_space else 2
     centre, about_centre = hands.centre, hands.shape
+    origins = tuple(dict.fromkeys(picks))
+    numbers = [origins.index(origin) for origin in picks]
 
     def moved(x: FloatArray) -> Axes:
         offsets = iter(x.reshape(-1, width))
@@ -115,13 +129,14 @@ def _fitted_line(candidates: Candidates, axes: Axes, hands: ShownHands, origins:
         return replace(axes, ends=tuple(ends))
 
     def residuals(x: FloatArray) -> FloatArray:
-        line = replace(candidates, axes=(moved(x),))
-        shape = np.einsum("iyx,itpy->tipx", line.rotations()[0], about_centre)
+        line = moved(x)
+        own = replace(candidates, axes=(line,), origins=tuple(one.on(line) for one in origins) if tied else origins)
+        shape = np.einsum("iyx,itpy->tipx", own.rotations()[0], about_centre)
         parts = [hands.from_mean(shape) * TURN_WEIGHT]
-        start, design, penalty = line.model(np.zeros(3), hands.second)
-        for number, origin in enumerate(origins):
+        start, design, penalty = own.model(np.zeros(3), hands.second)
+        for step, origin in enumerate(numbers):
             flat = design[0, origin].reshape(-1, len(penalty))
-            target = (centre[:, number] - start[origin]).ravel()
+            target = (centre[:, step] - start[origin]).ravel()
             w = np.linalg.solve(flat.T @ flat + np.diag(penalty), flat.T @ target)
             parts.append((target - flat @ w)[:, None])
         return np.concatenate([*(part.ravel() / NOISE_M for part in parts), x / POINT_STD_M])
@@ -147,11 +162,14 @@ def _fitted(candidates: Candidates, errors: Errors, hands: ShownHands, picks: In
         w = np.zeros(GROWTH.start + 3 * len(candidates.growing))
         w[candidates.numbers] = found[: len(candidates.numbers)]
         shares = w[SHARES].reshape(2, 3)[: len(origin.ends) - 1]
+        points = w[POINTS].reshape(3, 3)[: len(origin.ends)]
+        if origin.points:
+            points = np.array([1 - shares[:, 0].sum(), *shares[:, 0]])[:, None] * origin.points
         frames.append(
             Frame(
                 candidates.axes[m],
                 origin.ends,
-                tuple(w[POINTS].reshape(3, 3)[: len(origin.ends)]),
+                tuple(points),
                 tuple(shares if origin.by_axis else np.repeat(shares[:, :1], 3, axis=1)),
                 origin.weights,
                 tuple(zip(origin.growing, w[GROWTH].reshape(-1, 3), strict=False)),

@@ -24,8 +24,10 @@ from robust_instant_policy.context.things import (
 )
 from robust_instant_policy.geometry import FloatArray, robust_std, rotations_about_vertical
 
-RIGID_SPREADS = 3.5  # keypoints whose distance varies by so many times the smallest variation belong to the same thing,
+RIGID_SPREADS = 3.0  # keypoints whose distance varies by so many times the smallest variation belong to the same thing,
 RIGID_SPREAD_M = (0.006, 0.015)  # within these limits
+OUTLIER_SCATTERS = 4.0  # median distance of keypoints from their places in a thing; one so far off is an outlier
+BIWEIGHT_REACH = 9.0  # median deviations up to which a value counts
 DEMOS_FOR_MEDIANS = 5  # with fewer, an outlier cannot be identified
 SHAPE_TOLERANCE = 0.15  # of a thing's size: how far its shape may vary beside its size
 LEAST_SWING_RAD = 0.2  # a part that turns less than this shows no hinge
@@ -55,7 +57,7 @@ def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
         nodes = to_tree(tree, rd=True)[1]
         groups = [tuple(sorted(node.pre_order())) for node in nodes if not node.is_leaf()]
         return [*_solid(groups, keypoints, RIGID_SPREAD_M[1]), *(Thing("point", (k,)) for k in range(num_points))]
-    varies = spread(distances)
+    varies = _scatter(distances)
     least = np.median(np.where(np.eye(num_points, dtype=bool), np.inf, varies).min(axis=1))
     tolerance = float(np.clip(RIGID_SPREADS * least, *RIGID_SPREAD_M))
     clusters = _clusters(varies, tolerance)
@@ -70,8 +72,16 @@ def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
 
 
 def _clusters(varies: FloatArray, tolerance: float) -> list[tuple[int, ...]]:
-    """Groups of keypoints all of whose distances vary less than ``tolerance``."""
+    """Groups of keypoints all of whose distances vary less than ``tolerance``.
+
+    A keypoint near a hinge may be of either part: it is counted to that to which its distances vary least.
+    """
     labels = fcluster(linkage(squareform(varies, checks=False), "complete"), tolerance, "distance")
+    for _ in range(2):
+        member = labels[:, None] == np.unique(labels)  # (K, groups)
+        several = member.sum(axis=0) > 1
+        apart = np.where(several, varies**2 @ member / np.maximum(member.sum(axis=0) - member, 1), np.inf)
+        labels = np.where((member & several).any(axis=1), np.unique(labels)[apart.argmin(axis=1)], labels)
     return [tuple(map(int, np.flatnonzero(labels == label))) for label in np.unique(labels)]
 
 
@@ -91,8 +101,8 @@ def _solid(groups: Sequence[tuple[int, ...]], keypoints: FloatArray, tolerance: 
     for kind, size in kinds:
         for group in groups:
             if len(group) >= size:
-                shape, mirrors = _mean_shape(keypoints[:, list(group)], kind == "upright", tolerance)
-                things.append(Thing(kind, group, shape, mirrors=mirrors))
+                shape, mirrors, outlier = _mean_shape(keypoints[:, list(group)], kind == "upright", tolerance)
+                things.append(Thing(kind, group, shape, mirrors=mirrors, outlier=outlier))
     return things
 
 
@@ -205,8 +215,21 @@ def spread(values: FloatArray) -> FloatArray:
     return robust_std(values)
 
 
-def _mean_shape(points: FloatArray, upright: bool, tolerance: float) -> tuple[FloatArray, bool]:
-    """The centred shape ``(N, 3)`` of which ``points (I, N, 3)`` are noisy, moved copies, and whether it ``mirrors``.
+def _scatter(distances: FloatArray) -> FloatArray:
+    """The same for distances that are noisy alone, of which it makes better use: the biweight (Mosteller and Tukey
+    1977)."""
+    if len(distances) < DEMOS_FOR_MEDIANS:
+        return distances.std(axis=0)
+    off = distances - np.median(distances, axis=0)
+    u = off / np.maximum(BIWEIGHT_REACH * np.median(np.abs(off), axis=0), 1e-9)
+    near = np.maximum(1 - u**2, 0)
+    slope = (near * (1 - 5 * u**2)).sum(axis=0)
+    return np.asarray(np.sqrt(len(distances) * (near**4 * off**2).sum(axis=0)) / np.abs(slope))
+
+
+def _mean_shape(points: FloatArray, upright: bool, tolerance: float) -> tuple[FloatArray, bool, float]:
+    """The centred shape ``(N, 3)`` of which ``points (I, N, 3)`` are noisy, moved copies, whether it ``mirrors``, and
+    how far off, metres, an outlier is.
 
     A reflection keeps all distances, but no motion leads to it: the fit is then off by more than ``tolerance``, metres.
     """
@@ -215,11 +238,14 @@ def _mean_shape(points: FloatArray, upright: bool, tolerance: float) -> tuple[Fl
     shape = points[typical] - points[typical].mean(axis=0)
     _, _, off = fit_either_hand(shape, points, upright, mirrors=True)
     mirrored = (off[0] > tolerance) & (off[1] < off[0] / 2)
-    mirrors = mirrored.sum() >= MIRRORED_DEMOS
+    mirrors = bool(mirrored.sum() >= MIRRORED_DEMOS)
+    outlier = OUTLIER_M
     for _ in range(2):
-        poses, hand, _ = fit_either_hand(shape, points, upright, mirrors)
+        poses, hand, _ = fit_either_hand(shape, points, upright, mirrors, outlier)
         back = (points - poses[:, None, :3, 3]) @ poses[:, :3, :3]
         back[..., 1] *= hand[:, None]
         shape = np.median(back, axis=0)
+        off = np.linalg.norm(back - shape, axis=-1)
+        outlier = max(OUTLIER_M, OUTLIER_SCATTERS * float(np.median(off)))
         shape = shape - shape.mean(axis=0)
-    return shape, bool(mirrors)
+    return shape, mirrors, outlier

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation
 
@@ -14,12 +15,14 @@ from robust_instant_policy.context.codec import MM, read_rows, row_grammar, row_
 from robust_instant_policy.context.frames import Frame, runs
 from robust_instant_policy.context.prompt import INSTRUCTION, REACH_MM, Prompt
 from robust_instant_policy.context.step_frames import StepFrames
+from robust_instant_policy.context.things import WORLD
 from robust_instant_policy.context.ways import Split
 from robust_instant_policy.geometry import FloatArray, fit_rigid
 from robust_instant_policy.query import Query
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX, Trajectory
 
 MIN_DEMOS_TO_AGREE = 3
+RIDGE_MM = 20.0  # standard deviation of an input below which it explains little
 INPUTS_PER_QUERY = 2  # keypoint coordinates shown with each example
 NOISE_MM = 5.0  # variation of a keypoint coordinate that carries no information
 INTERPOLATED_MM = 5.0  # a step whose numbers follow from its neighbours this closely is not asked for
@@ -161,13 +164,49 @@ def make_questions(
     frames: StepFrames, inputs: FloatArray, offsets: FloatArray, key_steps: Sequence[int]
 ) -> tuple[Question, ...]:
     """What to ask of demonstrations with keypoints ``inputs (I, T, A, 3·K)`` and ``offsets (I, T, 7·A)`` from their
-    median in ``frames``."""
+    median in ``frames``: the numbers that vary, and, where frames follow things, that inputs predict better than the
+    median does."""
+    varies = _varies(offsets)
+    if len(offsets) >= MIN_DEMOS_TO_AGREE and any(frame.things != (WORLD,) for frame in frames.used):
+        for arm in range(frames.num_arms):
+            own = [HAND_DIM * arm + dim for dim in range(HAND_STATE)]
+            for step in np.flatnonzero(varies[:, own].any(axis=1)):
+                varies[step, own] &= predictable(inputs[:, step, arm], offsets[:, step, own])
+    offsets = np.where(varies, offsets, 0.0)
     questions = (
         _question(arm, steps, offsets, inputs)
         for arm, own in enumerate(frames.arms)
         for steps in _blocks(own, key_steps, offsets[..., HAND_DIM * arm : HAND_DIM * (arm + 1)])
     )
     return tuple(question for question in questions if question is not None)
+
+
+def _varies(offsets: FloatArray) -> NDArray[np.bool_]:
+    """On which numbers ``(T, 7·A)`` demonstrations with ``offsets (I, T, 7·A)`` differ."""
+    is_state = np.arange(offsets.shape[2]) % HAND_DIM == HAND_STATE
+    if len(offsets) < MIN_DEMOS_TO_AGREE:
+        return np.broadcast_to(~is_state, offsets.shape[1:])
+    return np.where(is_state, offsets.any(axis=0), np.sqrt((offsets**2).mean(axis=0)) > MM * NOISE_M)
+
+
+def predictable(inputs: FloatArray, outputs: FloatArray) -> NDArray[np.bool_]:
+    """Which of the numbers ``outputs (I, D)`` the keypoint coordinates ``inputs (I, 3·K)`` predict better than the mean
+    of the demonstrations does, all in millimetres.
+
+    Each demonstration is predicted from the others alone, by ridge regression on those of the inputs that a query would
+    show. The rest is noise, which a model would only imitate.
+    """
+    missed = np.zeros((2, *outputs.shape))
+    for demo in range(len(outputs)):
+        others = np.arange(len(outputs)) != demo
+        chosen = list(informative_inputs(inputs[others], outputs[others]))
+        mean = outputs[others].mean(axis=0)
+        x = inputs[:, chosen] - inputs[others][:, chosen].mean(axis=0)
+        gram = x[others].T @ x[others] + others.sum() * RIDGE_MM**2 * np.eye(len(chosen))
+        slope = np.linalg.solve(gram, x[others].T @ (outputs[others] - mean))
+        missed[:, demo] = outputs[demo] - mean, outputs[demo] - mean - x[demo] @ slope
+    usual, own = (missed**2).sum(axis=1)
+    return np.asarray(own < usual)
 
 
 def _blocks(frames: Sequence[Frame], key_steps: Sequence[int], offsets: FloatArray) -> list[list[int]]:
@@ -193,16 +232,11 @@ def _blocks(frames: Sequence[Frame], key_steps: Sequence[int], offsets: FloatArr
 
 def _question(arm: int, steps: Sequence[int], offsets: FloatArray, shown: FloatArray) -> Question | None:
     """The question about ``steps`` of ``arm``, from the demonstrations' ``offsets (I, T, 7·A)`` from their median and
-    the ``shown (I, T, A, 3·K)`` keypoints, all in millimetres; None where all demonstrations agree."""
+    the ``shown (I, T, A, 3·K)`` keypoints, all in millimetres; None where nothing is to ask."""
     whole = np.round(offsets).astype(int)
     largest = np.abs(whole).max(axis=0)
-    is_state = np.arange(offsets.shape[2]) % HAND_DIM == HAND_STATE
-    if len(offsets) >= MIN_DEMOS_TO_AGREE:
-        varies = np.where(is_state, largest > 0, np.sqrt((offsets**2).mean(axis=0)) > MM * NOISE_M)
-    else:
-        varies = np.broadcast_to(~is_state, largest.shape)
     own = range(HAND_DIM * arm, HAND_DIM * (arm + 1))
-    asked = tuple((step, dim) for step in steps for dim in own if varies[step, dim])
+    asked = tuple((step, dim) for step in steps for dim in own if offsets[:, step, dim].any())
     if not asked:
         return None
     rows = np.stack([whole[:, step, dim] for step, dim in asked], axis=1)

@@ -5,14 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from robust_instant_policy.context.codec import MM
-from robust_instant_policy.context.factorised import FactorisedPrompt, informative_inputs
+from robust_instant_policy.context.factorised import RIDGE_MM, FactorisedPrompt, informative_inputs
 from robust_instant_policy.context.prompt import Prompt
 from robust_instant_policy.context.writing import adaptive_prompt
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.trajectory import ACTION_DIM, STATE_INDEX
 
 MIN_DEMOS = 3  # with fewer, nothing is left to learn from
-RIDGE_MM = 20.0  # standard deviation of an input below which it explains little
 
 
 def leave_one_out(prompt: Prompt) -> FloatArray:

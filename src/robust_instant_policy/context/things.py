@@ -18,7 +18,7 @@ from robust_instant_policy.geometry import (
 )
 
 DEMOS_TO_TELL_THINGS = 3  # with fewer, all distances look constant
-OUTLIER_M = 0.006  # residual at which a keypoint's influence on a fitted pose is halved
+OUTLIER_M = 0.006  # least distance from its place in a thing at which a keypoint counts as an outlier
 MIRROR = np.array([1.0, -1.0, 1.0])
 
 Kind = Literal["world", "point", "upright", "rigid", "scaled", "hinged"]
@@ -43,6 +43,7 @@ class Thing:
     ``shape (N, 3)``: ``upright`` about the vertical, ``rigid`` in all directions, ``scaled`` about the vertical with a
     size that differs from scene to scene, ``hinged`` about the axis of ``hinge``. The ``world`` has no members. A thing
     that ``mirrors`` is seen in either hand, as a left and a right shoe: its shape or that with the opposite y.
+    ``outlier``, metres: see `robust_fit`.
     """
 
     kind: Kind
@@ -50,6 +51,7 @@ class Thing:
     shape: FloatArray | None = None
     hinge: Hinge | None = None
     mirrors: bool = False
+    outlier: float = OUTLIER_M
 
     def __str__(self) -> str:
         if self.kind == "world":
@@ -127,15 +129,16 @@ def _located(thing: Thing, keypoints: FloatArray, found: Scene) -> Located:
         ratio = (np.conj(as_complex(thing.shape)) * as_complex(points - middle[:, None])).sum(axis=1)
         ratio = ratio / (np.abs(as_complex(thing.shape)) ** 2).sum()
         return Located(rotations_about_vertical(np.angle(ratio)), middle, np.abs(ratio), unit)
-    poses, hand, _ = fit_either_hand(thing.shape, points, thing.kind == "upright", thing.mirrors)
+    poses, hand, _ = fit_either_hand(thing.shape, points, thing.kind == "upright", thing.mirrors, thing.outlier)
     radius = float(rms_radius(thing.shape[None], 3)[0])  # 0 where all its keypoints coincide
     return Located(poses[:, :3, :3], poses[:, :3, 3], rms_radius(points, 3) / radius if radius else unit, hand)
 
 
-def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArray:
+def robust_fit(shape: FloatArray, points: FloatArray, upright: bool, outlier: float = OUTLIER_M) -> FloatArray:
     """Poses ``(I, 4, 4)`` that map ``shape (N, 3)`` onto ``points (I, N, 3)``, robust to a minority of outliers.
 
-    The best of all minimal subsets, refined by iteratively reweighted least squares.
+    The best of all minimal subsets, refined by iteratively reweighted least squares; a point that is off by
+    ``outlier``, metres, has a quarter of the weight.
     """
     size = 2 if upright else 3
     fit = fit_upright if upright else fit_rigid
@@ -144,22 +147,22 @@ def robust_fit(shape: FloatArray, points: FloatArray, upright: bool) -> FloatArr
     subsets = np.array(list(combinations(range(len(shape)), size)))
     starts = fit(shape[subsets], points[:, subsets], np.ones((len(points), *subsets.shape)))  # (I, subsets, 4, 4)
     loss = squared_norm(transform_points(starts, shape) - points[:, None])
-    best = np.argmin((loss / (loss + OUTLIER_M**2)).sum(axis=-1), axis=1)
+    best = np.argmin((loss / (loss + outlier**2)).sum(axis=-1), axis=1)
     pose = starts[np.arange(len(points)), best]
     for _ in range(5):
         residual = squared_norm(transform_points(pose, shape) - points)
-        pose = fit(np.broadcast_to(shape, points.shape), points, 1 / (1 + residual / OUTLIER_M**2) ** 2)
+        pose = fit(np.broadcast_to(shape, points.shape), points, 1 / (1 + residual / outlier**2) ** 2)
     return pose
 
 
 def fit_either_hand(
-    shape: FloatArray, points: FloatArray, upright: bool, mirrors: bool
+    shape: FloatArray, points: FloatArray, upright: bool, mirrors: bool, outlier: float = OUTLIER_M
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Poses ``(I, 4, 4)`` as of `robust_fit`, the hand ``(I,)``, -1 where the mirrored shape fits better, and the root
     mean square distances ``(H, I)``, metres, of the points from the shape and from the mirrored one if it ``mirrors``.
     """
     shapes = [shape, shape * MIRROR] if mirrors else [shape]
-    fits = np.stack([robust_fit(own, points, upright) for own in shapes])
+    fits = np.stack([robust_fit(own, points, upright, outlier) for own in shapes])
     fitted = np.stack([transform_points(poses, own) for poses, own in zip(fits, shapes, strict=True)])
     off = np.sqrt(squared_norm(fitted - points).mean(axis=-1))
     best = off.argmin(axis=0)

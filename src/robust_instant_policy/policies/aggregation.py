@@ -1,11 +1,14 @@
 """From candidates to one plan."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robust_instant_policy.context import FactorisedPrompt
 from robust_instant_policy.errors import InvalidValueError, PlanningError
+from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.confidence import (
     Evidence,
     distortion,
@@ -19,8 +22,12 @@ from robust_instant_policy.policies.policy import Plan, Stage, Stopwatch, Usage
 from robust_instant_policy.policies.sampling import Proposal
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.regression import RobustTrajectory, robust_gripper_trajectory
-from robust_instant_policy.sanity import errors
+from robust_instant_policy.sanity import Envelope, Finding, errors
 from robust_instant_policy.trajectory import Trajectory
+
+DISTANCES = {"envelope: position", "envelope: step length", "envelope: path length"}
+FARTHEST = 0.5  # of the longest side of the demonstrated box: farther outside of it, no frame supports a plan
+CARRIED_NOTE = "{}; the demonstrations carried over into this scene do the same"
 
 
 def aggregate(context: Context, scene: LocatedScene, proposal: Proposal, settings: Settings) -> Plan:
@@ -73,6 +80,29 @@ def agree(
         raise PlanningError(f"the answers are no trajectories of a gripper: {error}") from None
 
 
+def _outside(context: Context, keypoints: FloatArray, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """What of ``trajectory`` lies outside of what was demonstrated, each an error.
+
+    A warning where it lies within the demonstrations as their frames carry them over into the scene of ``keypoints (K,
+    3)``: things are farther apart there. Only distances may be larger, and places outside by `FARTHEST` at most.
+    """
+    envelope, prompt = context.report.envelope, context.prompt.for_scene(keypoints)
+    found = envelope.check(trajectory) if envelope is not None else ()
+    if envelope is None or not found or not isinstance(prompt, FactorisedPrompt):
+        return found
+    there = Envelope.of(prompt.carried_over(keypoints, len(prompt.shown)), envelope.plane)
+    unlike = {finding.kind for finding in there.check(trajectory)}
+    farthest = FARTHEST * float((envelope.upper - envelope.lower).max())
+    if any(one.kind == "envelope: position" and one.numbers["value"] > farthest for one in found):
+        return found
+    return tuple(
+        replace(one, severity="warning", message=CARRIED_NOTE.format(one.message))
+        if one.kind in DISTANCES and one.kind not in unlike
+        else one
+        for one in found
+    )
+
+
 def make_plan(
     context: Context,
     scene: LocatedScene,
@@ -87,13 +117,14 @@ def make_plan(
     is what several candidates agree on.
     """
     trajectory = Trajectory(chosen.actions, chosen.times)
-    outside = context.report.envelope.check(trajectory) if context.report.envelope is not None else ()
+    outside = _outside(context, scene.keypoints, trajectory)
     findings = (*context.report.findings, *scene.findings, *outside)
     frames = context.prompt.for_scene(scene.keypoints).frames
     evidence = Evidence(
         agreement=chosen.confidence,
         vote=context.prompt.decide(scene.keypoints)[1],
         doubled=len(scene.located.doubled),
+        carried=int(len(outside) > len(errors(outside))),
         distortion=distortion(context.keypoints, scene.keypoints),
         frames=frames.error,
         prediction=prediction(context.prediction_errors),

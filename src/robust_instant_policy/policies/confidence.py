@@ -1,11 +1,12 @@
 """The confidence of a plan: a calibrated probability that it is right.
 
-    P(right) = min(1, agreement / GOOD_AGREEMENT) · (1 + vote) / 2 · 2^-doubled · sigmoid(b_0 + Σ_j b_j f_j),   f_j <= 0
+    P(right) = min(1, agreement / GOOD_AGREEMENT) · (1 + vote) / 2 · 2^-doubled · `CARRIED`^carried
+               · sigmoid(b_0 + Σ_j b_j f_j)
 
-The features f_j are made from `Evidence` and are 0 where nothing speaks against the plan; the coefficients were fitted
-to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`, docs/trust.md). A
-plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a new scene, it is
-multiplied by `UNKNOWN`.
+The features f_j are made from `Evidence`, f_j <= 0, and are 0 where nothing speaks against the plan; the coefficients
+were fitted to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`,
+docs/trust.md). A plan that breaks a check has confidence 0; where demonstrations cannot tell how well they predict a
+new scene, it is multiplied by `UNKNOWN`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,7 @@ from robust_instant_policy.sanity import Finding
 COEFFICIENTS = {
     "constant": 2.84, "distortion": 1.82, "frames": 1.59, "novelty": 0.99, "displacement": 1.14, "doubts": 2.59,
 }  # fmt: skip
+CARRIED = 0.75  # factor for a plan beyond what was demonstrated: keeps it below a gate of 0.9, though most are right
 UNKNOWN = 0.5  # factor, and so the most that is claimed, where the demonstrations cannot tell
 UNKNOWN_NOTE = (
     "unchecked: the demonstrations cannot tell how well they predict a new scene (fewer than three, or all of one "
@@ -58,18 +60,20 @@ class Evidence:
 
     ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``vote`` in [0, 1] for the way to act
     that was followed, 0 where either of two may be meant (`Prompt.decide`); how many objects with keypoints are
-    ``doubled``: of two alike, it is not known which is meant; ``distortion`` of the distances between keypoints (see
-    `distortion`); ``frames``, metres, the error with which frames that are fitted to the other demonstrations predict
-    one at the gripper change at which they do so worst (`StepFrames.error`), and ``prediction``, that of the
-    demonstrations at the key step at which they predict each other best, which stands in for it without gripper
-    changes; ``novelty``, how far the scene lies from the demonstrations (see `novelty`); ``displacement``, metres, of
-    the plan against what lies around the gripper, and ``precision``, that of the demonstrations (`Surroundings`); how
-    many findings are ``doubts`` about the recording (`doubts`), and ``errors``.
+    ``doubled``: of two alike, it is not known which is meant; whether (1, else 0) the plan is ``carried`` beyond what
+    was demonstrated: the demonstrations, carried over into the scene, are so, too; ``distortion`` of the distances
+    between keypoints (see `distortion`); ``frames``, metres, the error with which frames that are fitted to the other
+    demonstrations predict one at the gripper change at which they do so worst (`StepFrames.error`), and ``prediction``,
+    that of the demonstrations at the key step at which they predict each other best, which stands in for it without
+    gripper changes; ``novelty``, how far the scene lies from the demonstrations (see `novelty`); ``displacement``,
+    metres, of the plan against what lies around the gripper, and ``precision``, that of the demonstrations
+    (`Surroundings`); how many findings are ``doubts`` about the recording (`doubts`), and ``errors``.
     """
 
     agreement: float
     vote: float
     doubled: int
+    carried: int
     distortion: float
     frames: float
     prediction: float
@@ -120,6 +124,7 @@ def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEF
     score = coefficients["constant"] + sum(coefficients[name] * value for name, value in evidence.features().items())
     agreement, vote = np.nan_to_num(evidence.agreement), np.nan_to_num(evidence.vote, nan=1.0)
     likely = min(1.0, agreement / GOOD_AGREEMENT) * (1 + vote) / 2 * 0.5 ** np.nan_to_num(evidence.doubled)
+    likely *= CARRIED ** np.nan_to_num(evidence.carried)
     return float(likely * expit(score) * (1.0 if evidence.is_known else UNKNOWN))
 
 
