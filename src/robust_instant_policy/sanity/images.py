@@ -165,7 +165,7 @@ def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
 
     What most do is no contradiction: one may reach as low as they do, as into a hole of which its image shows less.
     """
-    if len(views) < MIN_DEMONSTRATIONS + 1:
+    if len(views) < MIN_DEMONSTRATIONS:
         return []
     likeness = as_is.surroundings.likeness
     usual = float(np.median(likeness))
