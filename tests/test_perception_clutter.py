@@ -382,9 +382,11 @@ def test_an_object_of_another_size_has_less_confidence_and_an_unusual_stretch_sp
     same, longer = (extractor.locate(scene(7, long)[0]).confidence.mean() for long in (0.04, 0.06))
     assert longer < 0.7 * same
     surroundings = extractor.objects_[0].model.surroundings
-    unseen = np.zeros((2, len(surroundings.cells)), dtype=np.int8)
-    usual, exchanged = surroundings.log_chance_of(unseen, np.array([[0.0, 0.0], [0.3, -0.3]]))
+    unseen = np.zeros((3, len(surroundings.cells)), dtype=np.int8)
+    sizes = np.array([[0.0, 0.0, 0.0], [0.3, -0.3, 0.0], [0.0, 0.0, 0.3]])
+    usual, exchanged, lifted = surroundings.log_chance_of(unseen, sizes)
     assert usual - exchanged > 3
+    assert usual - lifted > 3
 
 
 def test_the_context_holds_the_demonstrations_that_show_the_grasped_thing():

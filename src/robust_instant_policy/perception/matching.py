@@ -54,7 +54,7 @@ MUCH_BETTER = 0.05  # of the score, by which an object's own registration overru
 MAX_PART_TRAVEL_M = 0.2  # against its object
 MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one,
 MAX_SHARED_BY_PART = 0.6  # and for a part, which touches its object
-SAME_LOOK = 0.85  # of an object's fitness and score, that a second thing in what is left of the image has if it is alike
+SAME_LOOK = 0.85  # of an object's fitness and score, that a second thing in what is left of the image has
 LEFT_OF_TWIN = 0.5  # share of an object's surface that an image shows of a second thing of its look
 
 
@@ -114,19 +114,19 @@ def register_model(
         return register(
             model.templates, view, taken, starts, parent=parent.pose, beside=beside, colour_cap=model.colour_cap
         )
-    loss = no_loss
-    if (around := model.surroundings) is not None:
-
-        def loss(motions: FloatArray) -> FloatArray:
-            return RIVAL_SCALE * around.lift_loss(motions)
-
-    alone = register(model.templates, view, taken, starts, colour_cap=model.colour_cap, loss=loss)
+    alone = register(model.templates, view, taken, starts, colour_cap=model.colour_cap, loss=_height_loss(model))
     if model.family:
         family = register(model.family, view, taken, colour_cap=model.colour_cap)
         in_family = register(model.templates, view, taken, family.pose[None], vote=False, colour_cap=model.colour_cap)
         if alone.score <= in_family.score + MUCH_BETTER:
             alone = in_family
     return _decided(model, alone, view)
+
+
+def _height_loss(model: Model) -> Loss:
+    """What an unusual height takes from the score of an object's motions."""
+    around = model.surroundings
+    return no_loss if around is None else lambda motions: RIVAL_SCALE * around.lift_loss(motions)
 
 
 def register(

@@ -101,7 +101,7 @@ class Surroundings:
         return np.asarray(evidence - self._size_losses(sizes).sum(axis=1))
 
     def lift_loss(self, motions: FloatArray) -> FloatArray:
-        """By how much the height ``(C,)`` at ``motions (C, 4, 4)`` speaks against them, of the logarithm of the chance."""
+        """What the height at ``motions (C, 4, 4)`` takes from the logarithm of their chance, ``(C,)``."""
         return self._size_losses(log_sizes(self.axes, motions))[:, 2]
 
     def _size_losses(self, sizes: FloatArray) -> FloatArray:
