@@ -17,7 +17,13 @@ from robust_instant_policy.geometry import FloatArray, project, transform_points
 from robust_instant_policy.perception.depth import MAX_LIFT_M, lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.matching import certainty, find_again, plausibility, register_all
-from robust_instant_policy.perception.models import MAX_MISSING, MIN_FITNESS, Registration, RigidObject
+from robust_instant_policy.perception.models import (
+    MAX_MISSING,
+    MIN_FITNESS,
+    SAME_THING_FITNESS,
+    Registration,
+    RigidObject,
+)
 from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.objects import find_objects, segmentation, without
@@ -152,6 +158,14 @@ class KeypointExtractor:
             notes.append(
                 f"{len(self.objects_)} objects were found for {self.num_keypoints} keypoints; {left} of them have none"
             )
+        with_keypoints = {i for number in np.flatnonzero(counts) for i in (number, self.objects_[number].model.parent)}
+        # What has no keypoints and is hardly recognised only takes the place of what has.
+        dropped = [
+            number not in with_keypoints and thing.typical_fitness < SAME_THING_FITNESS
+            for number, thing in enumerate(self.objects_)
+        ]
+        self.objects_ = without(self.objects_, dropped)
+        counts = [count for count, drop in zip(counts, dropped, strict=True) if not drop]
         self._places = []  # of each object's keypoints, in the first image
         buddies = best_buddies(views)
         for thing, count in zip(self.objects_, counts, strict=True):

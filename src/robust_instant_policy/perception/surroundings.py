@@ -29,6 +29,7 @@ LIFT_M = 0.2  # by which an object is higher, that counts like one that is large
 PRIOR_IMAGES = 2  # that counts like this many
 LEAST_DEVIATION = 2.0  # of the logarithm of the chance, added to that over the images
 UNUSUAL_DEVIATIONS = 3.0  # below what is usual, for a confidence of 1/e
+UNUSUAL_LIFT_M = 0.02  # above or below where it usually is, for a confidence of 1/e
 MAX_SIZE_LOSSES = 6.0, 6.0, 12.0  # of the logarithm of the chance, for each axis, and for the height
 
 
@@ -89,11 +90,14 @@ class Surroundings:
         return self.log_chance_of(shown(self.cells, view, motions), log_sizes(self.axes, motions))
 
     def likeness(self, view: View, motion: FloatArray) -> float:
-        """In [0, 1], less the more `log_chance` at ``motion (4, 4)`` is below what is usual."""
+        """In [0, 1], less the more `log_chance` at ``motion (4, 4)`` is below what is usual, and at another height."""
         if self.usual is None:
             return 1.0
         lack = self.usual[0] - float(self.log_chance(view, motion[None])[0])
-        return float(np.exp(-max(lack, 0) / (UNUSUAL_DEVIATIONS * (self.usual[1] + LEAST_DEVIATION))))
+        lift = LIFT_M * abs(log_sizes(self.axes, motion[None])[0, 2] - self.sizes[0, 2])
+        return float(
+            np.exp(-max(lack, 0) / (UNUSUAL_DEVIATIONS * (self.usual[1] + LEAST_DEVIATION)) - lift / UNUSUAL_LIFT_M)
+        )
 
     def log_chance_of(self, states: NDArray[np.int8], sizes: FloatArray) -> FloatArray:
         """The same of ``states (C, n)`` of the cells and `log_sizes` ``(C, 3)``."""
