@@ -27,7 +27,7 @@ from robust_instant_policy.perception.models import (
 from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.objects import find_objects, segmentation, without
-from robust_instant_policy.perception.registration import MIN_EXTENT_M, RESIDUAL_M, register_translation
+from robust_instant_policy.perception.registration import MAX_STRETCH, RESIDUAL_M, register_translation
 from robust_instant_policy.perception.relevance import hand_places, reference, relevances, shares, still
 from robust_instant_policy.perception.selection import best_buddies, select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
@@ -299,10 +299,10 @@ def _weights(
 def _expected_places(view: View, thing: RigidObject, places: FloatArray, found: Registration) -> FloatArray:
     """Where ``places (k, 3)`` of an object in the first image are in ``view``, metres, world."""
     expected = transform_points(found.motion, places)
-    if thing.model.varies and thing.model.parent < 0:  # its top was found, but its base stays on the table
-        lowest, highest = thing.points[:, 2].min(), thing.points[:, 2].max()
-        share = ((places[:, 2] - lowest) / max(highest - lowest, MIN_EXTENT_M)).clip(0, 1)
-        expected[:, 2] -= (1 - share) * (expected[:, 2] - places[:, 2])
+    lowest, highest = thing.points[:, 2].min(), thing.points[:, 2].max()
+    lift = found.motion[2, 3]  # of its top; unless the whole thing is lifted, its base stays on the table
+    if thing.model.varies and thing.model.parent < 0 and abs(lift) < (MAX_STRETCH - 1) * (highest - lowest):
+        expected[:, 2] -= lift * ((highest - places[:, 2]) / (highest - lowest)).clip(0, 1)
     if thing.model.varies or found.fitness >= SAME_SHAPE_FITNESS:
         return expected
     # An object of another size or articulation: register the neighbourhood of each keypoint.
