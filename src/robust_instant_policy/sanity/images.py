@@ -59,9 +59,9 @@ def check_contact(
         return _outliers(views, as_is)
     met = [index for index, c in enumerate(as_is.contacts) if c.path <= FAR_FROM_ALL_M]
     if MIN_SHARE * count < len(met) < count:  # are the others right without those that touch nothing?
-        parts = ([some[index] for index in met] for some in (views, paths, poses))
         contradicting = _outliers(views, as_is)
-        if errors(contradicting) and evidence(*parts).is_right:
+        of_met = evidence([views[i] for i in met], [paths[i] for i in met], [poses[i] for i in met])
+        if errors(contradicting) and of_met.is_right:
             return contradicting
     numbers = {
         "path_gap": as_is.path_gap,
