@@ -54,6 +54,8 @@ fingerprint() { cat pyproject.toml constraints.txt scripts/setup.sh | sha256sum 
 # Prints nothing and succeeds if the simulator can render an image on this machine.
 renderer_works() { .venv/bin/python -m robust_instant_policy.tasks.maniskill.renderer >/dev/null 2>&1; }
 
+mesa_version() { dpkg-query -W -f '${Version}' mesa-vulkan-drivers 2>/dev/null || echo 'of an unknown version'; }
+
 mujoco_renders() { .venv/bin/python -m robust_instant_policy.tasks.aloha.renderer >/dev/null 2>&1; }
 
 add_debian_backports() {
@@ -140,8 +142,9 @@ if ! mujoco_renders; then
   mujoco_renders || die "needs OpenGL without a screen; install libegl1 and libgl1-mesa-dri, or libosmesa6, and run again"
 fi
 if ! renderer_works; then
-  install_vulkan || die "needs a Vulkan driver; install mesa-vulkan-drivers (Mesa 23.1 or newer) and run again"
-  renderer_works || die "the simulator still finds no renderer; see: .venv/bin/rip doctor"
+  install_vulkan || die "needs a Vulkan driver; install mesa-vulkan-drivers (Mesa 25 or newer) and run again"
+  renderer_works || die "the simulator still finds no renderer with Mesa $(mesa_version); it needs 25 or newer \
+(Ubuntu 24.04: enable noble-updates and run again); see: .venv/bin/rip doctor"
 fi
 
 # The tests of `rip studio` look at its page in Chromium; without it they are skipped.

@@ -31,7 +31,7 @@ EXTRAS = {
     "studio": ("viser",),
 }
 RENDERERS = (  # name, package of the simulator, extra, family of tasks, what must be installed
-    ("ManiSkill", "mani_skill", "sim", "maniskill", "mesa-vulkan-drivers, Mesa 23.1 or newer"),
+    ("ManiSkill", "mani_skill", "sim", "maniskill", "mesa-vulkan-drivers, Mesa 25 or newer"),
     ("MuJoCo", "mujoco", "aloha", "aloha", "libegl1 and libgl1-mesa-dri, or libosmesa6"),
 )
 

@@ -19,7 +19,7 @@ def require_renderer() -> str:
     except RuntimeError as error:
         raise RendererError(
             f"the simulator's camera has no renderer ({error}); run: make setup "
-            "(or install mesa-vulkan-drivers 23.1 or newer)"
+            "(or install mesa-vulkan-drivers 25 or newer)"
         ) from error
     finally:
         sapien.render.set_log_level("warn")
