@@ -9,6 +9,7 @@ import pytest
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.geometry import GripperTriangle, make_pose, project
 from robust_instant_policy.perception import KeypointExtractor, matching
+from robust_instant_policy.perception.relevance import relevances
 from robust_instant_policy.perception.view import make_view
 from robust_instant_policy.policies.context import build_context
 from robust_instant_policy.policies.settings import Settings
@@ -401,6 +402,14 @@ def test_what_no_other_image_shows_takes_no_place_from_what_has_keypoints():
     extractor = KeypointExtractor(4, features="efficientnet")
     extractor.fit(*map(list, zip(*map(scene, range(5)), strict=True)))
     assert len(extractor.objects_) == 1
+
+
+def test_a_demonstration_that_shows_no_object_at_all_is_no_crash():
+    spots = places(0, 4)
+    thing = [np.array([[x, y, 0.05], [x, y + 0.01, 0.05]]) for x, y in spots]
+    paths = [path_to(x, y) for x, y in spots]
+    assert relevances([thing], paths)[0] > 0
+    assert relevances([[None, *thing[1:]]], paths)[0] > 0
 
 
 def test_the_rest_of_a_thing_is_no_second_one(monkeypatch):
