@@ -121,7 +121,12 @@ def _time_parts(bench: Workbench, spent: dict[str, float]) -> Callable[[], None]
     timed(task, "execute", "physics")
     for policy in bench._policies.values():
         timed(policy, "plan", "planning")
-    return lambda: [delattr(owner, name) for owner, name in undo] and None
+
+    def restore() -> None:
+        for owner, name in undo:
+            delattr(owner, name)
+
+    return restore
 
 
 def _scaling(suite: Suite, setup: Setup, folder: Path) -> list[str]:

@@ -138,11 +138,11 @@ def run(out: Path, data: Path, tasks: Sequence[str], rates: Sequence[int], scene
         spec = f"{server.url}#{NAME}-{rate}"
         return Setup(spec, False, out / "samples.sqlite", data, 300.0, films=False, analyses=False)
 
-    workbench.make_task = lambda *arguments: RememberingTask(make_task(*arguments))  # type: ignore[assignment]
+    workbench.make_task = lambda *arguments: RememberingTask(make_task(*arguments))
     with closing(workbench.Workbench(setup(0))) as bench:
 
         def here(setup: Setup, works: list[SceneWork]) -> Iterator[Outcome]:
-            bench.model = connect(setup.llm)  # type: ignore[assignment]  # a cached property
+            bench.model = connect(setup.llm)  # a cached property
             for work in works:
                 yield from bench.run(work)
 

@@ -22,6 +22,7 @@ from scipy.stats import binomtest
 from robust_instant_policy.evaluation.scenes import scene_seed
 from robust_instant_policy.evaluation.store import read_results
 from robust_instant_policy.tasks import make_task
+from robust_instant_policy.tasks.simulated_task import SimulatedTask
 
 TABLE = Path(__file__).parent.parent / "docs" / "tables" / "lerobot_eval.md"
 TASKS = [
@@ -52,6 +53,7 @@ def with_lerobot(env: Path, task: str, episodes: int, llm: str, out: Path) -> No
     if (out / "eval" / "eval_info.json").exists():
         return
     made = make_task(task)
+    assert isinstance(made, SimulatedTask)
     several = len(made.end_effectors) > 1
     arms = [{"model": MODELS[name], "name": name if several else ""} for name in made.end_effectors]
     options = [

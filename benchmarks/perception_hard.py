@@ -19,6 +19,7 @@ from robust_instant_policy.errors import KeypointError
 from robust_instant_policy.evaluation.scenes import obtain_demonstrations, scene_seed
 from robust_instant_policy.perception import CORRESPONDENCES, KeypointExtractor, measure
 from robust_instant_policy.tasks import UNSEEN_TASKS, make_task
+from robust_instant_policy.tasks.simulated_task import SimulatedTask
 
 SYMMETRIES = {
     "goal": 72,
@@ -53,6 +54,7 @@ def _measure(name: str, correspondence: str, seeds: list[int], data: Path) -> It
     if not seeds:
         return
     task = make_task(name, level="hard")
+    assert isinstance(task, SimulatedTask)
     demonstrations = obtain_demonstrations(task, data / name, DEMONSTRATIONS)
     images, truths = [], []
     for demonstration in demonstrations:
@@ -65,6 +67,7 @@ def _measure(name: str, correspondence: str, seeds: list[int], data: Path) -> It
     extractor.fit([one.observation for one in demonstrations], [one.trajectory for one in demonstrations])
     task.close()
     task = make_task(name, objects="unseen" if name in UNSEEN_TASKS else "seen", level="hard")
+    assert isinstance(task, SimulatedTask)
     for seed in seeds:
         seen = task.reset(seed)
         row: Row = {"seed": seed, "parts": [], "errors": [], "confidence": []}

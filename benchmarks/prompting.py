@@ -25,6 +25,7 @@ import numpy as np
 from pick_and_place import TASKS, WITHIN_M, PickAndPlace, Scene, key_error
 
 from robust_instant_policy.context import Frames, Layout, Prompt, write_prompt
+from robust_instant_policy.context.factorised import FactorisedPrompt
 from robust_instant_policy.errors import ModelError
 from robust_instant_policy.llm import LanguageModel, Listener, Sampling, connect
 from robust_instant_policy.query import Query
@@ -253,6 +254,7 @@ def reference_cells(task: str, scenes: int) -> list[str]:
     """The frames without a model: every number is the median of the demonstrations."""
     world = PickAndPlace(task)
     prompt = fitted([world.scene(seed) for seed in range(NUM_DEMOS)], "adaptive", "factorised")
+    assert isinstance(prompt, FactorisedPrompt)
     new = [world.scene(FIRST_NEW_SEED + number, exact=True) for number in range(scenes)]
     errors = [key_error(prompt.median_trajectory(scene.keypoints), scene.trajectory) for scene in new]
     return [task, "none: the median", "adaptive, factorised", "—", str(scenes), "—", "—", _errors(errors), *["—"] * 6]

@@ -185,11 +185,13 @@ class Set:
             return
         if case.method == "median":
             context, fit_s = self.context(Settings())
-            assert isinstance(context.prompt, FactorisedPrompt)
             start = time.perf_counter()
-            trajectory = context.prompt.for_scene(scene.keypoints).median_trajectory(scene.keypoints)
+            prompt = context.prompt.for_scene(scene.keypoints)
+            assert isinstance(prompt, FactorisedPrompt)
+            trajectory = prompt.median_trajectory(scene.keypoints)
             yield "median", judged([trajectory], truth, fit_s=fit_s, plan_s=time.perf_counter() - start)
             return
+        policies: dict[str, type[Neighbours | KeypointRegression]]
         policies = {"neighbours": Neighbours, "gp": KeypointRegression, "gp-world": KeypointRegression}
         settings = Settings(frames="world" if case.method == "gp-world" else "adaptive")
         policy, fit_s = self.fitted(case.method, policies[case.method](settings))

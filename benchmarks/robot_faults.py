@@ -21,7 +21,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -90,7 +90,8 @@ class Bench:
             f"driver = {{ kind = '{kind}' }}\n[emulation]\npace = {pace}\n"
         )
         self.name, self._config, self._real_time = name, CellConfig.load(path), real_time
-        self._context, self._emulation = None, None
+        self._context: AbstractContextManager[Emulation] | None = None
+        self._emulation: Emulation | None = None
 
     def ready(self) -> Emulation:
         """The running cell, without a fault and its arm parked."""

@@ -16,6 +16,7 @@ from robust_instant_policy.motion.waypoints import plan_waypoints
 from robust_instant_policy.robots.cell import CellConfig
 from robust_instant_policy.robots.models import arm_of
 from robust_instant_policy.tasks import TASK_NAMES, make_task
+from robust_instant_policy.tasks.simulated_task import SimulatedTask
 
 RATE_HZ = 50.0
 
@@ -29,6 +30,7 @@ def main() -> None:
     }
     for name in TASK_NAMES:
         shape, task = shapes["aloha" if name.startswith("aloha") else "ur5e"], make_task(name)
+        assert isinstance(task, SimulatedTask)
         least = []
         for attempt in map(task.demonstrate, seeds):
             demonstration = attempt.demonstration

@@ -35,6 +35,7 @@ from contaminated_trajectories import KINDS, NOTICEABLE_M, noisy
 
 from robust_instant_policy.context.alignment import align
 from robust_instant_policy.geometry import FloatArray
+from robust_instant_policy.llm.endpoint import SHORT
 from robust_instant_policy.llm.model import NOBODY, Listener, Sampling, Tally, estimate_tokens
 from robust_instant_policy.policies.gp import GaussianProcess
 from robust_instant_policy.query import Answer, Query
@@ -124,8 +125,13 @@ class Path:
 
 @lru_cache(maxsize=64)
 def read_examples(text: str) -> Examples:
-    """Blocks of a line of keypoints and a line for each step, with an empty line after each; see `SequencePrompt`."""
+    """Blocks of a line of keypoints and a line for each step, with an empty line after each; see `SequencePrompt`.
+
+    Raises `ValueError` for other text.
+    """
     blocks = [block.splitlines() for block in text.strip().split("\n\n")]
+    if not all(len(block) > 1 for block in blocks):
+        raise ValueError("it shows no examples: blocks of a line of keypoints and a line for each step")
     keypoints = np.array([block[0].split() for block in blocks], dtype=float) / MM
     trajectories = []
     for block in blocks:
@@ -141,7 +147,9 @@ def read_examples(text: str) -> Examples:
 
 
 def answer(prompt: str, seed: int, rate: float) -> str:
-    """One answer to ``prompt``, hallucinated with probability ``rate``."""
+    """One answer to ``prompt``, hallucinated with probability ``rate``. Raises `ValueError` without examples."""
+    if prompt.strip() == SHORT.text:  # the check of an address before any plan
+        return "4\n"
     shown, _, new = prompt.strip().rpartition("\n\n")
     examples = read_examples(shown)
     right = examples.infer(np.array(new.split(), dtype=float))
@@ -189,17 +197,24 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         known = self.path == "/v1/models"
-        self._send({"data": [{"id": f"{NAME}-{rate}"} for rate in range(0, 101, 10)]} if known else {}, known)
+        if known:
+            self._send({"data": [{"id": f"{NAME}-{rate}"} for rate in range(0, 101, 10)]})
+        else:
+            self._refuse(404, "no such path; models are listed at /v1/models")
 
     def do_POST(self) -> None:
         body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         named = re.fullmatch(rf"{NAME}-(\d+)", str(body.get("model")))
         if self.path not in ("/v1/chat/completions", "/v1/completions") or named is None or int(named[1]) > 100:
-            self._send({"error": {"message": f"no such model or path; models are {NAME}-0 to {NAME}-100"}}, False)
+            self._refuse(404, f"no such model or path; models are {NAME}-0 to {NAME}-100")
             return
         chat = self.path == "/v1/chat/completions"
         prompt = body["messages"][-1]["content"] if chat else body["prompt"]
-        texts = [answer(prompt, body.get("seed", 0) + k, int(named[1]) / 100) for k in range(body.get("n", 1))]
+        try:
+            texts = [answer(prompt, body.get("seed", 0) + k, int(named[1]) / 100) for k in range(body.get("n", 1))]
+        except ValueError as error:
+            self._refuse(400, f"the prompt cannot be answered: {error}")
+            return
         choices = [
             {"index": k, "finish_reason": "stop"} | ({"message": {"content": text}} if chat else {"text": text})
             for k, text in enumerate(texts)
@@ -210,9 +225,12 @@ class _Handler(BaseHTTPRequestHandler):
         }
         self._send({"choices": choices, "usage": usage})
 
-    def _send(self, body: dict[str, Any], known: bool = True) -> None:
+    def _refuse(self, status: int, message: str) -> None:
+        self._send({"error": {"message": message, "type": "invalid_request_error"}}, status)
+
+    def _send(self, body: dict[str, Any], status: int = 200) -> None:
         content = json.dumps(body).encode()
-        self.send_response(200 if known else 404)
+        self.send_response(status)
         self.send_header("Content-Type", "application/json")
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()

@@ -37,8 +37,8 @@ def main() -> int:
         command = ["-m", "robust_instant_policy.cli", "record", "--task", "aloha-pick-banana", "--episodes", "5"]
         subprocess.run([sys.executable, *command, "--images", "--out", folder], check=True)
     rows, failed = [], False
-    for name, (requirement, command, verdict, error_code) in GRADERS.items():
-        env, (program, *arguments) = options.graders / name, command.split()
+    for name, (requirement, call, verdict, error_code) in GRADERS.items():
+        env, (program, *arguments) = options.graders / name, call.split()
         if not (env / "bin" / program).exists():
             venv.create(env, with_pip=True)
             subprocess.run([env / "bin/python", "-m", "pip", "install", "--quiet", requirement], check=True)

@@ -45,6 +45,10 @@ def refused(arguments: list[str], capsys) -> tuple[int, str]:
         (["eval", "--methods", "magic", "--out", "x"], 2, "rip-gauss"),
         (["eval", "--sets", "200", "--out", "x"], 2, "100 sets"),
         (["demo", "--demos", "0"], 2, "at least once"),
+        (["demo", "--demos", "-1"], 2, "--demos -1: the task must be shown at least once"),
+        (["demo", "--demos", "absent"], 1, "there is no folder absent"),
+        (["demo", "--features", "nosuch"], 1, "no image descriptors 'nosuch'"),
+        (["eval", "--features", "nosuch", "--out", "x"], 1, "no image descriptors 'nosuch'"),
         (["eval", "--demos", "0", "--out", "x"], 2, "at least 1"),
         (["demo", "--seed", "-1"], 2, "whole number"),
         (["plan", "--demos", "absent", "--observation", "absent.npz"], 1, "absent.npz"),
@@ -60,6 +64,10 @@ def test_wrong_usage_is_told_in_one_line(arguments, status, words, capsys, tmp_p
 
 
 def test_what_belongs_to_something_else_is_refused_and_left_alone(tmp_path, capsys):
+    (tmp_path / "demos" / "meta").mkdir(parents=True)
+    (tmp_path / "demos" / "meta" / "rip.json").write_text("{}")
+    code, line = refused(["demo", "--out", str(tmp_path / "demos")], capsys)
+    assert (code, "holds demonstrations; choose another folder" in line) == (2, True)
     np.save(tmp_path / "one-array.npy", np.zeros(3))
     code, line = refused(["plan", "--demos", "absent", "--observation", str(tmp_path / "one-array.npy")], capsys)
     assert (code, "not an .npz" in line) == (1, True)

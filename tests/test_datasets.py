@@ -243,6 +243,11 @@ def test_only_a_folder_in_which_nothing_was_recorded_invites_recording(folder, t
     assert not isinstance(caught.value, NoDemonstrationsError)
 
 
+def test_a_folder_that_lost_its_info_is_not_called_unfinished(folder):
+    (folder / "meta/info.json").unlink()
+    assert "has lost meta/info.json, which describes its 3 episodes; restore it" in refusal(load_demonstrations, folder)
+
+
 @pytest.mark.parametrize(
     "file",
     [

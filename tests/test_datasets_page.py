@@ -66,9 +66,3 @@ def test_the_page_draws_itself_in_a_browser_without_an_error(folder, tmp_path):
     document, log = drawn(page, tmp_path)
     assert "CONSOLE" not in log
     assert len(re.findall(r'class="now">0\.00 s of 0\.71 s<', document)) == 3
-
-
-def test_the_old_name_still_works_and_says_where_the_new_one_is():
-    with pytest.warns(DeprecationWarning, match="reporting.demonstrations"):
-        from robust_instant_policy.datasets import write_page as old
-    assert old is write_page

@@ -1,7 +1,10 @@
 """The paper's configuration end to end: real simulator, real HTTP; trajectories come from the benchmarks' stand-in."""
 
+import json
 import sys
 import threading
+import urllib.error
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +109,16 @@ def test_the_stand_in_refuses_a_rate_above_100_percent(url, context, observation
     policy = rip.RobustInstantPolicy.paper(rip.connect(f"{url}#stand-in-150"), **PARTS).fit_context(context)
     with pytest.raises(ModelError, match="stand-in-0 to stand-in-100"):
         policy.plan(observation)
+
+
+@pytest.mark.parametrize("prompt", ["", "1 2 3 4", "hello\n\n1 2 3", "1 2 3\nx y\n\n1 2 3"])
+def test_the_stand_in_refuses_a_prompt_without_examples(url, prompt):
+    body = {"model": "stand-in-0", "prompt": prompt}
+    request = urllib.request.Request(f"{url}/completions", json.dumps(body).encode())
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        urllib.request.urlopen(request)
+    assert caught.value.code == 400
+    assert "the prompt cannot be answered" in json.load(caught.value)["error"]["message"]
 
 
 def test_the_stand_in_repeats_itself_and_hallucinates_at_the_rate_it_is_told(context, observation):

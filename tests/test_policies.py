@@ -277,13 +277,3 @@ def test_keypoints_that_slip_on_a_rigid_thing_are_measured():
     new[:2] += 0.03
     assert distortion(scenes, new) > 3
     assert np.isnan(distortion(scenes[:2], new))
-
-
-def test_old_names_still_work_with_a_warning():
-    import robust_instant_policy.policies as policies
-
-    with pytest.warns(DeprecationWarning, match="Settings"):
-        assert policies.KeypointContext(features="efficientnet") == SETTINGS
-    with pytest.warns(DeprecationWarning, match="KeypointActionTokens"):
-        instant = policies.InstantPolicy(Imitator(), temperature=0.5)
-    assert RobustInstantPolicy(instant, num_queries=3).settings == Settings(temperature=0.5, num_queries=3)

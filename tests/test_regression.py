@@ -13,10 +13,11 @@ import pytest
 from scipy.stats import t as student_t
 
 import robust_instant_policy.regression
-from robust_instant_policy.errors import InvalidValueError, UnknownNameError, UsageError
+from robust_instant_policy.errors import InvalidValueError, UsageError
 from robust_instant_policy.regression import (
     StudentTMixture,
     StudentTNetwork,
+    StudentTNumbers,
     StudentTRegression,
     diagnose,
     fit_numbers,
@@ -117,30 +118,19 @@ def test_candidates_may_have_their_own_times():
     assert np.allclose(fit.mean(np.array([0.0, 0.25, 1.0])), motion(np.array([0.0, 0.25, 1.0])), atol=1e-3)
 
 
-@pytest.mark.parametrize("unit", ["step", "trajectory", "number"])
 @pytest.mark.parametrize("dof", [0.7, 1.5, 5.0, np.inf])
 @pytest.mark.parametrize("kind", ["digits", "freeze"])
-def test_convergence_is_told(unit, dof, kind):
+def test_convergence_is_told(dof, kind):
     for seed in range(4):
-        fit = StudentTRegression(dof, unit).fit(points(draw_scene(seed, "piecewise", 5, 2, kind)))
+        fit = StudentTRegression(dof).fit(points(draw_scene(seed, "piecewise", 5, 2, kind)))
         assert fit.converged
         assert fit.num_iterations == len(fit.log_likelihood) > 1
 
 
-def test_where_every_number_is_by_itself_groups_change_nothing():
-    candidates = points(draw_scene(3, "smooth", 5, 1, "offset"))
-    for dof in (1.5, np.inf):
-        alone = StudentTRegression(dof, "number").fit(candidates)
-        grouped = StudentTRegression(dof, "number", groups=POINTS).fit(candidates)
-        assert np.array_equal(alone.mean(), grouped.mean())
-        assert np.array_equal(alone.scale(), grouped.scale())
-        assert np.array_equal(alone.log_likelihood, grouped.log_likelihood)
-
-
 def test_weights_are_low_where_a_candidate_is_hallucinated():
-    for unit in ("step", "trajectory", "number"):
-        scene = draw_scene(2, "smooth", 5, 1, "offset")
-        weights = [w.mean() for w in StudentTRegression(unit=unit).fit(points(scene)).weights]
+    scene = draw_scene(2, "smooth", 5, 1, "offset")
+    for estimator in (StudentTRegression(), StudentTNumbers()):
+        weights = [w.mean() for w in estimator.fit(points(scene)).weights]
         assert np.argmin(weights) == np.flatnonzero(scene.hallucinated)[0]
         assert min(weights) < 0.15
         assert all(0 <= w <= 1 for w in weights)
@@ -258,8 +248,6 @@ def test_bad_times_are_refused_by_name_and_shape(times, message):
 
 
 def test_other_bad_arguments_are_refused():
-    with pytest.raises(UnknownNameError, match="step, trajectory, number"):
-        StudentTRegression(unit="dimension")
     with pytest.raises(InvalidValueError, match=r"groups must be \(2,\).*\(3,\)"):
         StudentTRegression(groups=[0, 0, 1]).fit([np.zeros((4, 2))])
     fit = StudentTRegression().fit([np.zeros((4, 2))])
@@ -310,16 +298,6 @@ def test_where_candidates_disagree_the_curve_goes_on_as_it_may_be_expected_to():
     assert np.abs(straight.mean() - truth)[10].max() < 0.015
     assert np.abs(straight.mean() - jumps.mean())[[0, 5, 15, 19]].max() < 0.001
     assert straight.standard_error()[10].max() > 1.5 * straight.standard_error()[5].max()
-
-
-def test_the_old_name_of_the_curvature_works_with_a_warning():
-    _, candidates = disagreeing()
-    new = StudentTRegression(groups=np.zeros(3), curvature=[0.01, 0.02]).fit(candidates)
-    with pytest.warns(DeprecationWarning, match="curvature"):
-        old = StudentTRegression(groups=np.zeros(3), bends=[0.01, 0.02]).fit(candidates)
-    assert np.array_equal(new.mean(), old.mean())
-    with pytest.raises(UsageError, match="curvature"), pytest.warns(DeprecationWarning, match="bends"):
-        StudentTRegression(curvature=[0.01, 0.02], bends=[0.01, 0.02])
 
 
 def test_a_curvature_far_below_the_scatter_gives_a_straight_line_not_a_failure():

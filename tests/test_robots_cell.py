@@ -83,6 +83,8 @@ def test_another_calibration_or_gripper_has_another_digest(cell):
         ("joint_speed = 1.5", "joint_sped = 1.5", "joint_sped is not known here; is it misspelt"),
         ('model = "viperx-300"', "model = 3", "model must be text"),
         ("[cell]", "[cell", "is not a TOML file"),
+        ("[cell]", "[sell]", r"lacks the table \[cell\]; docs/robots.md shows"),
+        ("[[arms]]", "[[legs]]", r"lacks the table \[\[arms\]\]"),
         ('"gripper.toml"', '"other.toml"', "no file at"),
     ],
 )

@@ -281,6 +281,18 @@ def test_images_that_lost_what_the_camera_saw_are_told(report, scene, fault, wor
     assert any(words in str(finding) for finding in report.check_observation(FAULTS[fault].scene(scene, ())))
 
 
+def test_what_the_camera_did_not_see_is_told_in_one_sentence(report, scene):
+    half, none = np.array(scene.depth), np.full_like(scene.depth, np.nan)
+    half[:, : half.shape[1] // 2] = np.nan
+    for changed, words in (
+        (replace(scene, rgb=np.zeros_like(scene.rgb)), "the colour image is all the same"),
+        (replace(scene, depth=half), "depth is missing or unsteady in [45]\\d% of the scenery"),
+        (replace(scene, depth=none), "the depth image has no readings; check the camera's depth stream"),
+    ):
+        (found,) = errors(report.check_observation(changed))
+        assert re.match(words, found.message)
+
+
 def test_states_inverted_while_pushing_are_doubted(demonstrations):
     inverted = FAULTS["state-inverted:demos"].demonstrations(demonstrations)
     assert any("are its states inverted" in note for note in check_demonstrations(inverted).notes)

@@ -1,7 +1,5 @@
 """Checks of numbers from the caller; errors in one line."""
 
-from __future__ import annotations
-
 import math
 import reprlib
 import sys

@@ -1,7 +1,5 @@
 """The command ``rip``. Exit 0: the work was done; 1: something broke; 2: wrong usage."""
 
-from __future__ import annotations
-
 import argparse
 import errno
 import importlib

@@ -1,7 +1,5 @@
 """The interface between a closed-loop policy and a task."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from robust_instant_policy.demonstration import Observation

@@ -80,7 +80,7 @@ class Observation:
             with open_regular(path) as file:
                 return cls.read(file, path)
         except FileNotFoundError:
-            raise DatasetError(f"no observation at {path}") from None
+            raise DatasetError(f"no file at {path}; an observation is an .npz with {', '.join(ARRAYS)}") from None
 
     @classmethod
     def read(cls, file: BinaryIO, name: str | Path) -> Observation:

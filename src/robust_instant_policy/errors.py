@@ -3,8 +3,6 @@
 The command turns them into exit codes: 2 for wrong usage, 1 for everything else that broke.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Files on disk: written whole or not at all, and read only where they are regular files."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

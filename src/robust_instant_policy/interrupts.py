@@ -4,8 +4,6 @@ Python prints and drops a `KeyboardInterrupt` that is raised inside a destructor
 (imports have many) or a callback of a C library. So each Ctrl-C is noted, too, and raised again by `raise_pending`.
 """
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Sockets to listen on, loopback addresses, and a small HTTP server."""
 
-from __future__ import annotations
-
 import contextlib
 import ipaddress
 import socket

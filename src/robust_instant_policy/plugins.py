@@ -1,7 +1,5 @@
 """Classes of the user's own, named ``module:Class`` or registered by an entry point."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

@@ -1,7 +1,5 @@
 """Depth images as real cameras give them, and the table plane in the points that they hold."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -3,8 +3,6 @@
 `context` writes queries and reads answers, `llm` sends them; neither imports the other.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

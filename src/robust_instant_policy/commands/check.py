@@ -1,7 +1,5 @@
 """`rip check`: check demonstrations, and a new scene, against each other."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Progress on the terminal: one line per finished stage, a progress bar for the current one."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """`rip demo`: record demonstrations, plan in a new scene, execute, and write a run folder with a report."""
 
-from __future__ import annotations
-
 import argparse
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -10,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import DATA, RUNS, add_method, seed
+from robust_instant_policy.commands.options import DATA, RUNS, add_method, method_settings, seed
 from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import VideoWriter, load_demonstrations
+from robust_instant_policy.datasets.folder import holds_demonstrations, open_folder
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.errors import UnreachableError, UsageError
 from robust_instant_policy.evaluation import Variant, holds_results, obtain_demonstrations, scene_seed
@@ -34,11 +33,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Record missing demonstrations, plan and execute; writes the run folder."""
-    if options.demos.isdecimal() and int(options.demos) == 0:
-        raise UsageError("--demos 0: the task must be shown at least once")
+    if options.demos.removeprefix("-").isdecimal() and int(options.demos) < 1:
+        raise UsageError(f"--demos {options.demos}: the task must be shown at least once")
+    if not options.demos.isdecimal():
+        open_folder(Path(options.demos), options.task)  # raises before the simulator starts
+    method_settings(options)
     out = options.out or RUNS / f"{file_stem(options.task)}-{options.seed}"
     if holds_results(out):
         raise UsageError(f"{out} holds an evaluation; choose another folder with --out")
+    if holds_demonstrations(out):
+        raise UsageError(f"{out} holds demonstrations; choose another folder with --out")
     require_writable(out / PLAN_FILE)
     screen, scene = StageConsole(), scene_seed(options.seed, 0)
     screen.say(f"{options.task}: demonstrations, then a plan and its execution in a new scene (seed {scene})")

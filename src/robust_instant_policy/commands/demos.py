@@ -1,7 +1,5 @@
 """`rip demos`: delete, split, merge or restore demonstrations; a new folder is written each time."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`rip doctor`: check what this machine needs for `rip`, and say how to install what is missing."""
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import os

@@ -1,7 +1,5 @@
 """`rip eval`: run suites, store samples and rows, then write tables, figures and a page."""
 
-from __future__ import annotations
-
 import argparse
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`rip import`: write the demonstrations of another recording into a demonstrations folder."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

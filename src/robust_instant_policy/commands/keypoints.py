@@ -1,7 +1,5 @@
 """`rip keypoints`: a page with the keypoints of all demonstrations side by side, and their errors."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from contextlib import ExitStack, closing

@@ -1,7 +1,5 @@
 """`rip merge`: combine several evaluations in one folder."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

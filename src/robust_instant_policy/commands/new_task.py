@@ -1,7 +1,5 @@
 """`rip new-task`: write the template of a user's task, or check a task."""
 
-from __future__ import annotations
-
 import argparse
 from contextlib import closing
 from importlib.resources import files

@@ -1,11 +1,10 @@
 """Arguments that several commands share."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from robust_instant_policy.perception.network import require_features
 from robust_instant_policy.policies.settings import CONFIGS, WORDS, Settings
 from robust_instant_policy.tasks.level import LEVELS, PAPER
 from robust_instant_policy.tasks.task import bounded_seed
@@ -126,7 +125,9 @@ def add_keypoints(parser: argparse.ArgumentParser, features: str, correspondence
 
 
 def method_settings(options: argparse.Namespace) -> Settings:
-    """Those of ``--config``, and what was given beside it."""
+    """Those of ``--config``, and what was given beside it. Raises `ModelError` for unknown ``--features``."""
+    if options.features is not None:
+        require_features(options.features)
     names = ("features", "keypoints", "frames", "layout", "downsampling", "estimator")
     given = {name: getattr(options, name) for name in names}
     return Settings.of(options.config).changed(**{name: value for name, value in given.items() if value is not None})

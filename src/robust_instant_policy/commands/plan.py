@@ -1,7 +1,5 @@
 """`rip plan`: plan for one observation and write the plan; nothing is executed."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The policy that several commands plan with."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager

@@ -1,7 +1,5 @@
 """`rip record`: record demonstrations into a dataset folder, of a simulated task or on the arms of a real cell."""
 
-from __future__ import annotations
-
 import argparse
 from contextlib import closing
 from pathlib import Path

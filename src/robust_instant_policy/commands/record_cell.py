@@ -1,7 +1,5 @@
 """`rip record --robot`: record demonstrations with the leaders of a real or emulated cell."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """`rip report`: write the report of a run, or of an evaluation, again from its files."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

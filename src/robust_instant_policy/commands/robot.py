@@ -1,7 +1,5 @@
 """`rip robot`: check the devices of a cell, or emulate one."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

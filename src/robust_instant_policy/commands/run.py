@@ -1,7 +1,5 @@
 """`rip run`: plan for what a real cell's camera sees, show the plan, and execute it once it is confirmed."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`rip samples`: count or export the stored answers of a language model."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from contextlib import closing

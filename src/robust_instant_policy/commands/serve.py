@@ -1,7 +1,5 @@
 """`rip serve`: plan for robots that ask over openpi's websocket protocol, or over HTTP."""
 
-from __future__ import annotations
-
 import argparse
 import os
 

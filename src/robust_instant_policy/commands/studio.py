@@ -1,7 +1,5 @@
 """`rip studio`: demonstrate a task by hand in the browser, see why a plan is trusted, and let the arm execute it."""
 
-from __future__ import annotations
-
 import argparse
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`rip train`: train a method with progress output, and write a figure of the loss and of samples."""
 
-from __future__ import annotations
-
 import argparse
 from contextlib import closing
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`rip view`: write a page that shows every demonstration of a folder, and log them for Rerun."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

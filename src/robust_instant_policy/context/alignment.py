@@ -5,8 +5,6 @@ aligned segment by segment, so that "the last step before the grasp" is the same
 or a scripted expert turns, waits and hurries at other times in each: there, steps that mean the same are matched.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

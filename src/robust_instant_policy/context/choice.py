@@ -8,8 +8,6 @@
 6. The numbers of the chosen frames are fitted to all demonstrations, robustly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Numbers to text, and text back to numbers; an ambiguous text is refused."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Finds things: from how the distances of keypoints vary over the demonstrations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -11,8 +11,6 @@ met), and j_t the jump at a change of frame: by how much the motion between the 
 nearest steps without a change, less what demonstrations show there; 0 elsewhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import numpy as np

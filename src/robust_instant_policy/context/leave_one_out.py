@@ -1,7 +1,5 @@
 """How well demonstrations predict each other when one is left out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

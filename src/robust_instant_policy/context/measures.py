@@ -1,7 +1,5 @@
 """Measures of a scene that may decide between two ways to act, and where they part the demonstrations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -9,8 +9,6 @@ for all candidates and steps at once (the keypoints of the one that is left out 
 predicted by the mean of the others' in the axes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whole trajectories in one prompt, as Keypoint Action Tokens writes them (Di Palo and Johns 2024)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ Else a threshold on one measure of the scene may *split* the demonstrations in t
 demonstrations then predict each other better at the key steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations

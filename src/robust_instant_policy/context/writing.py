@@ -1,7 +1,5 @@
 """Select frames and serialise the demonstrations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import get_args

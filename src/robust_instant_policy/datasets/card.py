@@ -1,7 +1,5 @@
 """Files of a folder for readers that know nothing of this package: a dataset card, and the camera's calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

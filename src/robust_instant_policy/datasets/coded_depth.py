@@ -8,8 +8,6 @@ holds fringes of the period P, as in three-step phase shifting of structured lig
 Their phase gives the depth modulo P, the grey value the multiple of P.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ A folder may come from an unknown source, so its content is checked when it is r
 ``meta/info.json`` and ``meta/episodes``, and that all paths stay inside the folder.
 """
 
-from __future__ import annotations
-
 import math
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -112,6 +110,11 @@ class Folder:
         return inside(self.root, self.info[template].format(**fields))
 
 
+def holds_demonstrations(path: Path) -> bool:
+    """Whether ``path`` is a demonstrations folder, or one that is being recorded."""
+    return (path / layout.RIP_PATH).exists() or (path / layout.INFO_PATH).exists()
+
+
 def open_folder(path: Path, task: str | None = None) -> Folder:
     """Open a LeRobotDataset v3.0 folder with at least one episode.
 
@@ -127,7 +130,12 @@ def open_folder(path: Path, task: str | None = None) -> Folder:
         raise NoDemonstrationsError(f"{path} is empty; {advice}")
     if not (path / layout.INFO_PATH).exists():
         if (path / layout.RIP_PATH).exists():
-            raise NoDemonstrationsError(f"{path} holds no finished demonstration yet; {advice}")
+            lost = sum(file.suffix == ".parquet" for file in finished_files(path / "meta/episodes"))
+            if lost > 1:  # the file of the first one is there before the info, see `DatasetWriter`
+                raise DatasetError(f"{path} has lost {layout.INFO_PATH}, which describes its {lost} episodes; {REPAIR}")
+            raise NoDemonstrationsError(
+                f"{path} holds no finished demonstration: it has no {layout.INFO_PATH}; {advice}"
+            )
         raise DatasetError(f"{path} is not a demonstrations folder: it has no {layout.INFO_PATH}; {advice}")
     file = inside(path, layout.INFO_PATH)
     info = read_json(file)

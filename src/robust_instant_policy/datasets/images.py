@@ -1,7 +1,5 @@
 """The start-of-episode image and depth as lossless PNG files."""
 
-from __future__ import annotations
-
 import io
 import struct
 import warnings

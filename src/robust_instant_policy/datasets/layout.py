@@ -5,8 +5,6 @@ one or many episodes per file; here each episode has its own files, numbered lik
 recording only adds files. See ``docs/datasets.md``.
 """
 
-from __future__ import annotations
-
 import re
 import string
 from collections.abc import Collection

@@ -4,8 +4,6 @@ Conventions of ``src/lerobot/datasets/compute_stats.py`` of 0.4.4: images are sc
 sampled in frames and pixels; quantiles of a folder are those of its episodes, averaged with their number of frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The tables of a folder for writing: frames, episodes, tasks, and the features of a frame."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -5,8 +5,6 @@ reads and writes the samples. Outcomes are streamed back one by one. Importing t
 without the extra `distributed`.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass

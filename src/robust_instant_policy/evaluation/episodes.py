@@ -1,7 +1,5 @@
 """A row of the results: one execution."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from robust_instant_policy.evaluation.variant import Scene, Variant

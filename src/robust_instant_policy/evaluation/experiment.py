@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robust_instant_policy.datasets import layout
+from robust_instant_policy.datasets.folder import holds_demonstrations
 from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation.episodes import Episode, Trial
 from robust_instant_policy.evaluation.failures import Failure, video_file
@@ -118,7 +118,7 @@ def run_suites(
 def one_writer(out: Path) -> Iterator[None]:
     """Lock the run's folder ``out``. Raises `DatasetError` if another process writes to it, or if it holds
     demonstrations."""
-    if (out / layout.RIP_PATH).exists() or (out / layout.INFO_PATH).exists():
+    if holds_demonstrations(out):
         raise DatasetError(f"{out} holds demonstrations; give a folder of its own for the results")
     descriptor = lock_folder(out)
     try:

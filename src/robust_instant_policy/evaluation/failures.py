@@ -12,8 +12,6 @@ demonstrator or no ground truth: checks that need them are left out, and a failu
 attribute is *unknown*.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import cast

@@ -1,7 +1,5 @@
 """Merge runs: parts of a job that ran on several machines, or methods that were run separately."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass

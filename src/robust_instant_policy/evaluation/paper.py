@@ -1,7 +1,5 @@
 """The numbers that the paper prints, in percent, to stand beside one's own (Oh et al. 2025)."""
 
-from __future__ import annotations
-
 # Table I: success rates with 10 demonstrations and GPT-4o.
 TABLE1_TASKS = (
     "pick-banana", "push-cube", "open-drawer", "close-cabinet", "turn-faucet",

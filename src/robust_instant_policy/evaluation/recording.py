@@ -1,7 +1,5 @@
 """Record the demonstrations that an evaluation lacks, several tasks at a time."""
 
-from __future__ import annotations
-
 import multiprocessing
 import signal
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Execute one plan in one scene, or run one closed-loop policy in it."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass

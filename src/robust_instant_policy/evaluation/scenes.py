@@ -1,7 +1,5 @@
 """Seeds of test scenes, and the demonstrations of an evaluation."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterable
 from pathlib import Path

@@ -4,8 +4,6 @@ The unit is the scene. Executions in one scene, of several candidates or with se
 independent trials: they meet the same objects in the same places.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

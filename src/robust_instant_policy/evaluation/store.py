@@ -4,8 +4,6 @@ The key of a row holds everything that decides it. ``episodes.parquet``, ``failu
 exports; a folder that holds only exports can be read, too.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

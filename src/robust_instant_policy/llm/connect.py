@@ -1,7 +1,5 @@
 """A line of text that names a language model, and the model it names."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import cast

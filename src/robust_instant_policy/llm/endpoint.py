@@ -1,7 +1,5 @@
 """Any server that speaks OpenAI's protocol: OpenAI itself, vLLM, SGLang, llama.cpp, Ollama, LM Studio."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import random

@@ -1,7 +1,5 @@
 """The embedded model: Gemma 3 270M from its PyPI package, with its vocabulary cut to what numbers need."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -1,7 +1,5 @@
 """The interface of every language model, and the bookkeeping of answers that all of them share."""
 
-from __future__ import annotations
-
 import re
 import threading
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Reading what a server sends: JSON, error messages and answers. Nothing in a reply is trusted to have its type."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

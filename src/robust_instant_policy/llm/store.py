@@ -1,7 +1,5 @@
 """The sample store: all answers of all language models in one SQLite file, to record and to replay."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import hashlib

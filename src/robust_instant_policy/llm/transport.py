@@ -1,7 +1,5 @@
 """HTTP with one server: the key, the proxy, the size limit of replies, and one-line errors."""
 
-from __future__ import annotations
-
 import asyncio
 import email.utils
 import math

@@ -1,7 +1,5 @@
 """The checks of every motion before an arm moves. Each raises `UnreachableError` for the first step that fails."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations
 

@@ -4,8 +4,6 @@ Everything that moves an arm goes through a `Gate`: executed plans (`admit` refu
 slows down). `judge` looks at the measured states.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections import deque

@@ -5,8 +5,6 @@ plan ──check_waypoints──▶ plan_waypoints ──retimed──▶ check_
 Only commands that passed `check_motion` are sent; `gate.Gate` looks at each of them once more.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Forward and inverse kinematics of an arm, by mink on its MuJoCo model."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The limits of a cell, and the message of a limit that is exceeded."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

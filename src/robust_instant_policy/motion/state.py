@@ -1,7 +1,5 @@
 """Commands for an arm, and its measured state."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from robust_instant_policy.geometry import FloatArray

@@ -6,8 +6,6 @@ home ──lead-in──▶ waypoint 0 ──1/rate──▶ waypoint 1 ──�
 All arms of a task share one clock: the slowest arm determines the duration of a segment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

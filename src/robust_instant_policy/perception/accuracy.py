@@ -5,8 +5,6 @@ median, over the demonstrations, of its coordinates in the part's frame. Where t
 (chests, say) these are relative to the part's visible extent along each axis.
 """
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Depth of the surface at a pixel, in images with holes and flying pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -1,7 +1,5 @@
 """Descriptors of EfficientNet-lite0 (ImageNet); its weights come with a Python package, so they work offline."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 from functools import cache

@@ -1,7 +1,5 @@
 """Registration of known objects in a view: each alone, all together, and its rivals."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 

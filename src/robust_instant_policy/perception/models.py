@@ -1,7 +1,5 @@
 """What an object looks like, and where it was found in an image."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Choice of the network that describes images."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 
@@ -41,6 +39,14 @@ def choose_network(features: str | DescriptorNetwork, settings: DescriptorSettin
     from robust_instant_policy.perception.vit import VitDescriptors
 
     return VitDescriptors(checkpoint, replace(settings, model=source)), note
+
+
+def require_features(features: str) -> None:
+    """Raises `ModelError` for a text that names no descriptors; to call before long work."""
+    if features not in ("auto", "dino", "efficientnet"):
+        from robust_instant_policy.perception.vit_checkpoint import require_source
+
+        require_source(features)
 
 
 def resolve_features(features: str, model: str = DescriptorSettings.model) -> str:

@@ -1,7 +1,5 @@
 """The rigid objects of demonstrations: pieces of the first image, their parts, and their places in all images."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Parts of a piece of an image that move against the rest of it: doors, drawers, levers, and things that touched."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Foreground points that belong together: connected pieces, and what is no thing on the table."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt

@@ -7,8 +7,6 @@
 Objects stand on a table, so rotations are about the world's z axis only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

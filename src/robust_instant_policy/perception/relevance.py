@@ -1,7 +1,5 @@
 """Which objects matter: those that the demonstrations' hand approaches, grasps, or moves relative to."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Choice of keypoints on an object: seen and recognised in all images, with depth, and spread out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

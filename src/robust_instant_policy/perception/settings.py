@@ -1,7 +1,5 @@
 """Parameters of the descriptors; the paper's two columns by name (Oh et al. 2025, Table II)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 FACETS = ("key", "query", "value", "token")

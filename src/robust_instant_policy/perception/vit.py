@@ -4,8 +4,6 @@ Descriptors are a facet of one layer, saliency the attention of the class token 
 `transformers` runs the model; this file adds overlapping patches and DINO's interpolation of position encodings.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any

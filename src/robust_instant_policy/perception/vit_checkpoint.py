@@ -1,7 +1,5 @@
 """Vision transformers of `transformers`, from the hub, a folder or a safetensors file. Only tensors are read."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import os
@@ -41,14 +39,24 @@ def load_checkpoint(source: str) -> VitCheckpoint:
     for package in ("torch", "transformers", "safetensors"):
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(package, "vision")
+    require_source(source)
     path = Path(source).expanduser()
     if path.is_dir():
         return _from_folder(path)
     if path.is_file():
         return _from_file(path)
-    if path.suffix == ".safetensors" or source.count("/") != 1 or source.startswith((".", "/", "~")):
-        raise ModelError(f"there is no folder or file {source!r}, and it is not a name on the hub (owner/model)")
     return _from_folder(_checked(cached_folder(source) or _download(source)))
+
+
+def require_source(source: str) -> None:
+    """Raises `ModelError` for a text that is no folder or file, and no name on the hub. Loads nothing."""
+    path = Path(source).expanduser()
+    named = path.suffix != ".safetensors" and source.count("/") == 1 and not source.startswith((".", "/", "~"))
+    if not (path.exists() or named):
+        raise ModelError(
+            f"no image descriptors {source!r}: known are auto, dino and efficientnet, a folder or .safetensors file of "
+            "a ViT, and a name on the hub (owner/model)"
+        )
 
 
 def cached_folder(name: str) -> Path | None:

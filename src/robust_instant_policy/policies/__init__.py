@@ -3,8 +3,6 @@
 A method over keypoints is a walk through pure stages: `build_context`, `locate`, `sample`, `propose`, `aggregate`.
 """
 
-import warnings
-
 from robust_instant_policy.policies.aggregation import aggregate
 from robust_instant_policy.policies.catalogue import (
     ASKING_METHODS,
@@ -73,12 +71,3 @@ __all__ = [
     "sample",
     "scene_of_keypoints",
 ]
-
-_RENAMED = {"KeypointContext": "Settings", "InstantPolicy": "KeypointActionTokens"}
-
-
-def __getattr__(name: str) -> object:
-    if name not in _RENAMED:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    warnings.warn(f"{name} is called {_RENAMED[name]} now", DeprecationWarning, stacklevel=2)
-    return globals()[_RENAMED[name]]

@@ -1,7 +1,5 @@
 """From candidates to one plan."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

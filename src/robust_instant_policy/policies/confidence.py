@@ -8,8 +8,6 @@ plan that breaks a check has confidence 0; where demonstrations cannot tell how 
 multiplied by `UNKNOWN`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

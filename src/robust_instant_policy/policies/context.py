@@ -1,7 +1,5 @@
 """The context [V, A] of the demonstrations (Oh et al. 2025, Sec. III-A), and a new scene's keypoints V'."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Keypoint action tokens: execute what the language model says (Di Palo and Johns 2024)."""
 
-from __future__ import annotations
-
 from robust_instant_policy.checks import checked_positive
 from robust_instant_policy.llm import DEADLINE_S, LanguageModel
 from robust_instant_policy.policies.aggregation import take_first
@@ -25,15 +23,13 @@ class KeypointActionTokens(KeypointPolicy):
 
     def __init__(
         self,
-        llm: LanguageModel | KeypointActionTokens,
+        llm: LanguageModel,
         settings: Settings | None = None,
         *,
         deadline_s: float = DEADLINE_S,
         progress: Progress = no_progress,
         **options: object,
     ):
-        if isinstance(llm, KeypointActionTokens):  # version 0.1: the instant policy, made before
-            settings, deadline_s, progress, llm = settings or llm.settings, llm.deadline_s, llm.progress, llm.llm
         super().__init__(settings, progress=progress, **options)
         self.llm, self.deadline_s = llm, checked_positive("deadline_s", deadline_s)
 

@@ -1,7 +1,5 @@
 """What all methods over keypoints have in common."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Self

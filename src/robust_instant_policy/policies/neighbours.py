@@ -1,7 +1,5 @@
 """The nearest demonstrations, transferred to the new scene: neither learning nor a language model."""
 
-from __future__ import annotations
-
 from robust_instant_policy.context import FactorisedPrompt
 from robust_instant_policy.errors import UsageError
 from robust_instant_policy.policies.aggregation import aggregate

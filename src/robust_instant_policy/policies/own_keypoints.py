@@ -1,7 +1,5 @@
 """Keypoints of one's own: from a tracker, fiducial markers or a pose estimator."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol, Self, runtime_checkable
 

@@ -1,7 +1,5 @@
 """The robust instant policy (Oh et al. 2025, Algorithm 1): keep what the candidates agree on."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Self
 

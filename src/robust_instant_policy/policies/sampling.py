@@ -1,7 +1,5 @@
 """Ask the language model for trajectories: Φ([V, A], V') → ξ̂ (Oh et al. 2025, Sec. III-A; Di Palo and Johns 2024)."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """How methods that must be trained are trained: where to, for how long, on what, and who watches."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ No corner, pause or grasp is too sharp for it. What keeps it from following nois
 Symmetric matrices over the knots are stored as lower bands ``(3, K)``, LAPACK's layout.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg.lapack import dpbsv

@@ -8,8 +8,6 @@ The paper leaves recognising hallucinations to future work (Oh et al. 2025, Sec.
 A wrong digit and a slow drift both drive it up, noise does not, and the step at which it last left zero is the onset.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

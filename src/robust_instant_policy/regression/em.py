@@ -18,8 +18,6 @@ Numbers that are right or wrong together share one u. With p of them u ~ Gamma(p
 the scale shrinks onto a single candidate.)
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A robust trajectory for a gripper: rigid at every step, with a state that is open or closed and does not chatter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -65,8 +63,6 @@ def robust_gripper_trajectory(
     tolerance: float = TOLERANCE_M,
     curvature: ArrayLike | None = None,
     variation: ArrayLike | None = None,
-    *,
-    bends: ArrayLike | None = None,
 ) -> RobustTrajectory:
     """The robust gripper trajectory of ``candidates``, each ``(T_q, 10·A)``: three points (m) and the state, per arm.
 
@@ -80,11 +76,11 @@ def robust_gripper_trajectory(
     ``tolerance``, metres, is what `RobustTrajectory.confidence` is about. ``curvature (B,)``, metres, is the expected
     standard deviation of the points' second differences (see `StudentTRegression`); only "em" uses it. ``variation
     (V,)``, metres and evenly spread over time, is how far demonstrations differ along the way: a candidate that is off
-    by less is not called hallucinated. The trajectory does not depend on it. ``bends`` is the old name of curvature.
+    by less is not called hallucinated. The trajectory does not depend on it.
     """
     dof, seed = checked_positive("dof", dof, infinite=True), checked_whole("seed", seed)
     check_name("estimator", estimator, ESTIMATORS)
-    tolerance, expected = checked_positive("tolerance", tolerance), checked_curvature(curvature, bends)
+    tolerance, expected = checked_positive("tolerance", tolerance), checked_curvature(curvature)
     usual = None if variation is None else _checked_variation(variation)
     if not isinstance(triangle, GripperTriangle | None):
         raise InvalidValueError(f"triangle must be a GripperTriangle, got {type(triangle).__name__}")

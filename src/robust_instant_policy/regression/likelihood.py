@@ -1,6 +1,6 @@
 """The likelihood that is fitted: Eq. 1 of the paper for curves in time, with priors on scale and curvature.
 
-Of N samples a_n (D,) at times t_n, with one u for the D numbers of a step (or of a whole candidate), the fit maximises
+Of N samples a_n (D,) at times t_n, with one u for the D numbers of a step, the fit maximises
 
     Σ_n r_n log S(a_n | t_n; ν)                                          Eq. 1; σ²(t) = s · p(t), r_n: `Problem.trust`
     - D (ν_G+1)/2 Σ_k log(1 + λ g_k²/ν_G)                                second differences g, in scales: Student's t
@@ -11,8 +11,6 @@ over the curve, the squared scale s (D,) and its profile p (K,), where R is the 
 Each of the three updates of an iteration maximises its expected value, so that it never falls. (Only the scale's leaves
 out `FAINT_PRICE`, where that applies.)
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -42,7 +40,7 @@ class Fit:
     """What is estimated: the ``curve (K, D)`` and the squared scale, ``squared_scale (D,)`` times ``profile (K,)``.
 
     The rest follows from these: ``residuals (N, D)`` a - μ(t); ``distance (N,)`` δ², the mean of (a - μ(t))²/σ²(t) over
-    the numbers that share one u; ``weights (N,)`` r w; ``curvature (K-2,)`` g², squared second differences in scales.
+    the D numbers of a step; ``weights (N,)`` r w; ``curvature (K-2,)`` g², squared second differences in scales.
     """
 
     curve: FloatArray
@@ -58,8 +56,8 @@ class Fit:
 class Problem:
     """What is given: the samples, and how far each of them is trusted.
 
-    ``unit`` is what shares one u. ``groups (D, D)`` averages over dimensions with one scale. ``floor (D,)`` bounds the
-    squared scale. ``known_precision (K-2,)`` is 1/b² of a known curvature. ``trust (N,)`` is r. ``stiffness`` is λ.
+    ``groups (D, D)`` averages over dimensions with one scale. ``floor (D,)`` bounds the squared scale.
+    ``known_precision (K-2,)`` is 1/b² of a known curvature. ``trust (N,)`` is r. ``stiffness`` is λ.
     ``fixed_scale (D,)`` is the squared scale where it is not estimated.
     """
 
@@ -67,7 +65,6 @@ class Problem:
     basis: HatBasis
     differences: SecondDifferences
     dof: float
-    unit: str
     groups: FloatArray
     floor: FloatArray
     known_precision: FloatArray
@@ -75,15 +72,8 @@ class Problem:
     stiffness: float = 0.0
     fixed_scale: FloatArray | None = None
 
-    @property
-    def shared_numbers(self) -> float:
-        """How many numbers share one u, on average."""
-        return self.data.num_dimensions * (float(self.data.lengths.mean()) if self.unit == "trajectory" else 1.0)
 
-
-def pose_problem(
-    data: Candidates, dof: float, unit: str, groups: FloatArray, curvature: FloatArray | None
-) -> tuple[Problem, Fit]:
+def pose_problem(data: Candidates, dof: float, groups: FloatArray, curvature: FloatArray | None) -> tuple[Problem, Fit]:
     """The problem for ``data`` and the fit to start from: a curve near the densest candidates.
 
     The first scale is that of the half of the candidates nearest to the median. ``curvature (B,)``, evenly spread over
@@ -109,7 +99,7 @@ def pose_problem(
         expected = np.interp(knots[1:-1], known, curvature) * (np.diff(knots).mean() * (len(curvature) - 1)) ** 2
         precision = expected**-2.0
     trust = np.ones(len(data.values))
-    problem = Problem(data, basis, differences, dof, unit, groups, floor, precision, trust)
+    problem = Problem(data, basis, differences, dof, groups, floor, precision, trust)
     return problem, evaluate(problem, curve, squared, np.ones(len(basis.knots)))
 
 
@@ -128,9 +118,6 @@ def evaluate(problem: Problem, curve: FloatArray, squared_scale: FloatArray, pro
     """The `Fit` of a curve and a scale: the E-step."""
     residuals = problem.basis.residuals(problem.data.values, curve)
     distance = mean_over_scale(residuals**2, squared_scale) / problem.basis.spread(profile)
-    if problem.unit == "trajectory":
-        lengths = problem.data.lengths
-        distance = np.repeat(np.add.reduceat(distance, problem.data.starts[:-1]) / lengths, lengths)
     weights = problem.trust * expected_precision(distance, problem.dof)
     curvature = mean_over_scale(problem.differences(curve) ** 2, squared_scale)
     return Fit(curve, squared_scale, profile, residuals, distance, weights, curvature)
@@ -194,11 +181,7 @@ def improve(problem: Problem, fit: Fit) -> Fit:
 def log_likelihood(problem: Problem, fit: Fit) -> float:
     """The penalised log-likelihood that `improve` raises; the terms are those at the head of this file."""
     dimension, total_trust = len(fit.squared_scale), problem.trust.sum()
-    if problem.unit == "trajectory":
-        lengths, firsts = problem.data.lengths, problem.data.starts[:-1]
-        total = log_density(fit.distance[firsts], 0.0, problem.dof, dimension * lengths).sum()
-    else:
-        total = problem.trust @ log_density(fit.distance, 0.0, problem.dof, dimension)
+    total = problem.trust @ log_density(fit.distance, 0.0, problem.dof, dimension)
     log_profile = np.log(fit.profile)
     total -= 0.5 * dimension * (problem.basis.gather(problem.trust) @ log_profile)
     total -= 0.5 * total_trust * (np.log(fit.squared_scale) + problem.floor / fit.squared_scale).sum()

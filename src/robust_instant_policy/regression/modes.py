@@ -1,7 +1,5 @@
 """Which candidates go the same way, and where the ways with the most candidates tie."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import squareform

@@ -1,7 +1,5 @@
 """How smooth the curve is: the stiffness with the least expected error."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

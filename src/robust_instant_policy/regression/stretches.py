@@ -1,7 +1,5 @@
 """Rejection of outlying stretches: a hallucination is seldom a matter of one step."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

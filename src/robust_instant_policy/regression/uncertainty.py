@@ -1,7 +1,5 @@
 """How far the robust trajectory may be from the truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -45,7 +43,7 @@ def squared_error(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray]:
     """
     differences = problem.differences
     outlying = fit.distance / (problem.dof + fit.distance)
-    slope = 1 - 2 / problem.shared_numbers * (fit.weights @ outlying) / fit.weights.sum()
+    slope = 1 - 2 / problem.data.num_dimensions * (fit.weights @ outlying) / fit.weights.sum()
     deciding = deciding_candidates(problem, fit)
     inflation = (small_sample_factor(deciding) / max(slope, MIN_SLOPE) ** 2)[:, None]
 

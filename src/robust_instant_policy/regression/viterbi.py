@@ -1,7 +1,5 @@
 """Viterbi path of two states."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robust_instant_policy.geometry import FloatArray

@@ -1,8 +1,6 @@
 """Tables and figure of a published benchmark: success by group of difficulty beside published numbers and by task, and
 failures by stage."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from statistics import fmean
 from typing import Any

@@ -1,7 +1,5 @@
 """Interactive charts of a plan: paths in 3-D, weights, and every action dimension over time."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A self-contained page with the findings of `sanity.check_demonstrations` and the start images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where the paper's numbers may be shown beside measured ones."""
 
-from __future__ import annotations
-
 from robust_instant_policy.evaluation.paper import table1
 from robust_instant_policy.evaluation.statistics import Summary
 from robust_instant_policy.evaluation.variant import PAPER_CONFIGS, Variant

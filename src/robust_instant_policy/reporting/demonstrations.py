@@ -1,7 +1,5 @@
 """A self-contained page that shows every episode of a demonstrations folder."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The self-contained page of an evaluation: ``index.html``."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

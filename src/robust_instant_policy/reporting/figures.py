@@ -1,7 +1,5 @@
 """The paper's figures, drawn from rows: readable in greyscale, every axis with its unit."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

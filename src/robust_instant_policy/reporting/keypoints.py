@@ -1,7 +1,5 @@
 """A self-contained page that shows where the keypoints are: in every demonstration and in new scenes."""
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Sequence
 

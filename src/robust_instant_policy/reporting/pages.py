@@ -1,7 +1,5 @@
 """HTML pages from the templates beside this file. Every value is escaped unless it is `Markup`."""
 
-from __future__ import annotations
-
 import base64
 import re
 from typing import Any

@@ -1,7 +1,5 @@
 """Camera images with keypoints and paths over them, as values for the template `picture`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The tables, figures and the page of an evaluation, written from its rows."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -5,8 +5,6 @@ The entities are the same for all: ``world/camera`` with ``rgb`` and ``depth``, 
 Importing it raises `MissingExtraError` without the extra `rerun`.
 """
 
-from __future__ import annotations
-
 import os
 import socket
 import sys

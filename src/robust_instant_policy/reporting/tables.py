@@ -1,7 +1,5 @@
 """The paper's tables, with confidence intervals and significance tests."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The protocol of an RGB-D camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -121,13 +121,13 @@ class Section:
         return box
 
     def section(self, key: str) -> Section:
-        value = self._take(key, None)
+        value = self._take(key, None, f"[{key}]")
         if not isinstance(value, Mapping):
             raise self.error(key, f"must be a table, not {value!r}")
         return Section(value, f"{self._where}: {key}")
 
     def sections(self, key: str) -> list[Section]:
-        value = self._take(key, None)
+        value = self._take(key, None, f"[[{key}]]")
         if not isinstance(value, list) or not value or not all(isinstance(one, Mapping) for one in value):
             raise self.error(key, f"must be one or more tables [[{key}]]")
         return [Section(one, f"{self._where}: {key}[{index}]") for index, one in enumerate(value)]
@@ -145,8 +145,10 @@ class Section:
     def error(self, key: str, words: str) -> CellError:
         return CellError(f"{self._where}: {key} {words}")
 
-    def _take(self, key: str, default: Any) -> Any:
+    def _take(self, key: str, default: Any, table: str = "") -> Any:
         value = self._values.pop(key, default)
+        if value is None and table:
+            raise CellError(f"{self._where} lacks the table {table}; docs/robots.md shows a cell's file")
         if value is None:
             raise self.error(key, "is missing")
         return value

@@ -1,7 +1,5 @@
 """`rip robot check`: is each device there, how fast does it answer, and what is wrong with it?"""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -3,8 +3,6 @@
 Registers are those of the X series' control table (Robotis e-Manual, XM540-W270).
 """
 
-from __future__ import annotations
-
 import errno
 import math
 import termios

@@ -1,7 +1,5 @@
 """Checks between a camera image, a plan and a motion of real arms, and the motions before a plan."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import count
 

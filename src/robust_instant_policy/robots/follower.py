@@ -1,7 +1,5 @@
 """The protocol of an arm that executes commands."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from robust_instant_policy.motion.state import ArmState, Command

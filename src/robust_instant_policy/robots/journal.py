@@ -4,8 +4,6 @@ A hidden folder beside the dataset holds ``start.npz`` (the observation), ``fact
 each step is appended at once.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The protocol of a device that a person moves to command a follower."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from robust_instant_policy.motion.state import ArmState, Command

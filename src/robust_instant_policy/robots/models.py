@@ -1,7 +1,5 @@
 """Models of known arms: kinematics from a URDF, gripper and limits from data sheets."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

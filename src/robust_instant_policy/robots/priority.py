@@ -1,7 +1,5 @@
 """Real-time priorities, where the system permits them: root, or ``rtprio`` in /etc/security/limits.conf."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Iterator

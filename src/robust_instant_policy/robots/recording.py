@@ -3,8 +3,6 @@
 leaders ─read─▶ soft start ─▶ wanted ─▶ `Station.lead` (gate, followers) ─▶ measured states ─▶ journal, episode
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

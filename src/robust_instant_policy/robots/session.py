@@ -3,8 +3,6 @@
 park ─▶ start image ─▶ soft start ─▶ demonstration ─▶ kept or discarded ─▶ park …
 """
 
-from __future__ import annotations
-
 import os
 import tomllib
 from collections.abc import Callable, Sequence

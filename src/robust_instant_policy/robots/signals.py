@@ -1,7 +1,5 @@
 """Ctrl-C, SIGTERM and a closed terminal become a request to stop, which the control loop checks in each step."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ displacement of the depth image. At no displacement it is about that by chance w
 Stripes, shadows and sides of another colour move the peak, too, so that a small displacement is a warning and no error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

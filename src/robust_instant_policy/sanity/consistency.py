@@ -5,8 +5,6 @@ shows around the gripper, seen in the gripper's own frame, must repeat across de
 wrong camera, image or pairing makes it random. No threshold in metres is needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

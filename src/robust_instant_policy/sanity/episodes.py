@@ -1,7 +1,5 @@
 """Demonstrations as a set, without their images: states, lengths, units, copies, and who differs."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 

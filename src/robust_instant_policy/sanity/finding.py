@@ -1,7 +1,5 @@
 """What a check found out, and the errors that it becomes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -36,7 +34,7 @@ class _FindingsError(RipError):
 
     def __init__(self, findings: Iterable[Finding]):
         self.findings = tuple(findings)
-        super().__init__("; ".join(finding.message for finding in self.findings))
+        super().__init__("; ".join(finding.message for finding in self.findings).replace("?; ", "? "))
 
 
 class GeometryError(_FindingsError):

@@ -1,7 +1,5 @@
 """Whether images, cameras and gripper paths of a set of demonstrations belong together, and if not, why."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

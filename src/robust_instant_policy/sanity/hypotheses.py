@@ -1,7 +1,5 @@
 """Known mistakes of cameras and recordings, each with the correction that undoes it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """What one RGB-D image with its camera says about itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -45,7 +43,8 @@ def check_image(view: View) -> list[Finding]:
         found.append(Finding("intrinsics", "warning", words + advice, {"off_centre": off}, "principal point"))
     readings = float(np.isfinite(view.depth).mean())
     if readings < MIN_READINGS:
-        words = f"{readings:.0%} of the depth image has a steady reading; check the camera's depth stream"
+        share = f"steady readings in only {readings:.0%} of its pixels" if readings else "no readings"
+        words = f"the depth image has {share}; check the camera's depth stream"
         return [*found, Finding("depth", "error", words, {"readings": readings})]
     for lines, colours, what in (
         (view.height, view.rgb, "rows"),

@@ -1,7 +1,5 @@
 """The images of a set of demonstrations against its paths."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

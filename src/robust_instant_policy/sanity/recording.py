@@ -1,7 +1,5 @@
 """Were gripper states, tool frames, rotations and times recorded rightly? The images contain the proof."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`check_demonstrations`: everything that a set of demonstrations says about itself, about new scenes and plans."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -97,6 +95,8 @@ class SetReport:
         found += check_table(view, known.plane, known.centre) + check_hole(view, known.widest_hole)
         edges = agreement(view)
         found += check_scene_depth_shift(view, edges, known.depth_shift) + check_scene_agreement(edges, known.edges)
+        if any(finding.cause == "depth of another lens" for finding in found):
+            return tuple(found)  # without its depth, what is raised is unknown
         return (*found, *_check_novelty(view, known))
 
     def require_observation(self, observation: Observation) -> tuple[Finding, ...]:

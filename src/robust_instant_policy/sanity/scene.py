@@ -1,13 +1,12 @@
 """A new scene against what the demonstrations' images have in common."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.geometry import FloatArray, lift
 from robust_instant_policy.sanity.finding import Finding
 from robust_instant_policy.sanity.hypotheses import OF_DEPTH, OF_IMAGES, OF_POSE
+from robust_instant_policy.sanity.image import UNIFORM
 from robust_instant_policy.sanity.scenery import CameraChange, Likeness, Scenery, camera_change
 from robust_instant_policy.sanity.view import View
 
@@ -40,14 +39,15 @@ def check_against_scenery(view: View, scenery: Scenery) -> list[Finding]:
     found = []
     missing = float(np.isnan(view.depth)[scenery.static].mean())
     if missing > MISSING:
-        words = f"depth is missing in {missing:.0%} of the scenery that the demonstrations' images have"
+        words = f"depth is missing or unsteady in {missing:.0%} of the scenery that the demonstrations' images have"
         advice = "; is it of another lens or stream, or not aligned to colour?"
         found.append(Finding("scenery", "error", words + advice, {"missing": missing}, "depth of another lens"))
     if small and scenery.swapped(view):
         words = "red and blue are exchanged: the image is BGR, the demonstrations' are RGB, or the other way round"
         found.append(Finding("scenery", "error", words, cause="BGR"))
     same_depth = like.depth >= SAME_PICTURE * scenery.agreed
-    same_texture = not scenery.textured or like.texture >= SAME_TEXTURE * scenery.texture
+    compares_texture = scenery.textured and view.rgb.std() >= UNIFORM  # `check_image` tells an image without content
+    same_texture = not compares_texture or like.texture >= SAME_TEXTURE * scenery.texture
     explained = _explain(view, scenery, like) if small else None
     numbers = {
         "same_depth": like.depth,
@@ -146,7 +146,8 @@ def _unexplained(scenery: Scenery, like: Likeness, same_depth: bool) -> tuple[st
     if not same_depth:
         words = f"{like.depth:.0%} of the scenery's depth are as in the demonstrations"
         return "camera moved", f"{words}: the camera was moved, or the depth is of another scene or stream"
-    words = f"the scenery looks different (texture agrees by {like.texture:.2f}, theirs by {scenery.texture:.2f})"
+    told = f"texture agrees by {like.texture:.2f}" if np.isfinite(like.texture) else "it has no texture"
+    words = f"the scenery looks different ({told}, theirs by {scenery.texture:.2f})"
     advice = ": the camera was moved, the colour image is of another stream, or the table is covered"
     return "camera moved, or another colour image", words + advice
 

@@ -6,8 +6,6 @@ new image's map around the planned gripper must be shifted to match theirs. No k
 second way to place the gripper, independent of the first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self

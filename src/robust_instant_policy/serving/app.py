@@ -1,7 +1,5 @@
 """The two protocols of the server: openpi's websocket at ``/``, HTTP with JSON at ``/plans``."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import secrets

@@ -1,7 +1,5 @@
 """Access control of the server, and limits for requests."""
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 from collections.abc import Awaitable, Callable, MutableMapping

@@ -4,8 +4,6 @@ openpi packs maps with msgpack, and an array as a map with the bytes ``__ndarray
 as keys (a NumPy number with ``__npgeneric__``, ``data`` and ``dtype``).
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import math

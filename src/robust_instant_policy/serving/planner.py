@@ -1,7 +1,5 @@
 """A bounded queue in front of a policy: one plan at a time, with progress and cancelling; unsafe plans are refused."""
 
-from __future__ import annotations
-
 import logging
 import secrets
 import threading

@@ -1,7 +1,5 @@
 """Running the server."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The tab "Act": preview, execution and comparison of plans, and objects that are moved by hand."""
 
-from __future__ import annotations
-
 import threading
 from functools import partial
 

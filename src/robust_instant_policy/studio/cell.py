@@ -1,7 +1,5 @@
 """The studio's interface to a cell, simulated or recorded."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Only one browser controls the page; the others watch."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any

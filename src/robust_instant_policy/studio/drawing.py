@@ -1,7 +1,5 @@
 """Geometry that the page shows, independent of the browser."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 from collections.abc import Sequence

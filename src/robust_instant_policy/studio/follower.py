@@ -1,7 +1,5 @@
 """Arms that follow dragged target poses, with the same inverse kinematics, limits and checks as other motions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 

@@ -4,8 +4,6 @@ viser listens on the loopback interface only; the gate passes connections on to 
 address' path, so the page's websocket has it, too.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 import re

@@ -1,7 +1,5 @@
 """HTML that the page shows, from the macros of ``templates/panel.html``. Every value is escaped."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from typing import Any

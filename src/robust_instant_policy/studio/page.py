@@ -1,7 +1,5 @@
 """The page: a session's cell in 3-D, and the panel with which a person demonstrates."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """The tab "Plan": what was seen, the candidates, and what they agree on."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Sequence
 from functools import partial

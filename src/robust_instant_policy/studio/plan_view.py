@@ -1,7 +1,5 @@
 """Draws a plan in the 3-D scene."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 

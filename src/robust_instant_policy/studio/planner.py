@@ -1,7 +1,5 @@
 """Planning in a thread beside the running cell: stages can be cancelled, regressions are repeated at once."""
 
-from __future__ import annotations
-
 import math
 import threading
 import traceback

@@ -1,7 +1,5 @@
 """Animation of a plan: a translucent copy of the arms moves along it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """A cell without a simulator or arm: the photographs of a folder of demonstrations."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The server of the page: from the command's options to a running studio."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import signal

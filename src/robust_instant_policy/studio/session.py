@@ -1,7 +1,5 @@
 """Runs a cell in real time, in one thread: arms follow a person or play a plan; demonstrations are stored."""
 
-from __future__ import annotations
-
 import queue
 import time
 import traceback

@@ -1,7 +1,5 @@
 """The cells of simulated tasks: bodies of SAPIEN and MuJoCo as surfaces."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The 3-D scene of the page: bodies, grippers' handles, and what the camera saw."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any

@@ -1,7 +1,5 @@
 """Steps of a demonstration that is recorded, and its editing: pauses are cut, small vibrations smoothed."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@
 entry point registers, and ``module:Class`` for a class of one's own (`own`, docs/own-tasks.md).
 """
 
-from __future__ import annotations
-
 from robust_instant_policy.errors import UnknownNameError
 from robust_instant_policy.plugins import is_own, load_class
 from robust_instant_policy.tasks.families import BENCHMARKS, FAMILIES

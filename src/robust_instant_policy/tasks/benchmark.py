@@ -1,7 +1,5 @@
 """What is known of a benchmark of other people beside its tasks: groups, tuning tasks, published results."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

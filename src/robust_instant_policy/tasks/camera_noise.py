@@ -4,8 +4,6 @@ Numbers follow the Intel RealSense D415: 55 mm between its imagers, about 920 pi
 a matching error of about 0.08 pixels, disparities in 1/32 pixel, readings in millimetres, zero where there is none.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ An expert lists the `Stroke`s; `perform` executes them with the variation of one
 follow the minimum-jerk profile of human reaching (Flash and Hogan 1985).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

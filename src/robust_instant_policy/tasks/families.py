@@ -1,7 +1,5 @@
 """The tasks of this package: families that share a simulator."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any

@@ -6,8 +6,6 @@ part of the objects, and another start pose of the arm.
 A cell draws everything from the `Layout` of one episode, so a task only says where its objects are and what they need.
 """
 
-from __future__ import annotations
-
 import colorsys
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Off-screen images of a MuJoCo scene."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray

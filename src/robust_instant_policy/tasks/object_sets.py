@@ -1,7 +1,5 @@
 """Two sets of objects: those of the demonstrations, and those that no demonstration shows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 

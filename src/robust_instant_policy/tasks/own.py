@@ -1,7 +1,5 @@
 """Tasks of one's own: any class with `reset` and `execute`, named ``module:Class`` or registered by an entry point."""
 
-from __future__ import annotations
-
 from inspect import getdoc
 from typing import Any
 

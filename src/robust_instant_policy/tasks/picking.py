@@ -1,7 +1,5 @@
 """Picking an object from the table: the strokes, and the reason of a failure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tool poses for experts."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """Recording demonstrations: the demonstrator tries one scene after another; only successes are stored."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from inspect import signature

@@ -1,7 +1,5 @@
 """The simulator's ground truth for an image, to measure perception; not for policies."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A simulated environment with a demonstrator, behind the contract of `tasks.task.Task`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Does a task of one's own keep the contract of `tasks.task.Task`? One finding for each thing that it does not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NoReturn, TypeVar

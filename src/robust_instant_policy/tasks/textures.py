@@ -1,7 +1,5 @@
 """Textures of materials, as sRGB images."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Converting a recording to demonstrations, or to a demonstrations folder."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path

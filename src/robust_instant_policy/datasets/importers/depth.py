@@ -8,8 +8,6 @@ A code q of a video stands for the depth d, with the parameters that the feature
 The code 0 is what a missing reading becomes, so it is none here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Reading HDF5 files from other people: errors in one line, and no access to other files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path

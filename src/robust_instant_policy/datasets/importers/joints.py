@@ -1,7 +1,5 @@
 """Joint positions and a URDF become poses of a link. Needs MuJoCo and mink (extra `robots`)."""
 
-from __future__ import annotations
-
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence

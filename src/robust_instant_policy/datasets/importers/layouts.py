@@ -11,8 +11,6 @@ Names may have any prefix; ``left`` and ``right`` in it tell two arms apart. Tho
 are no pose.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The format does not store the camera's intrinsics and pose or the meaning of gri
 Which features hold poses and grippers, see `lerobot_poses`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which features of a LeRobot v3 dataset hold the poses and the states of grippers; see `layouts` for their columns."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import chain, product

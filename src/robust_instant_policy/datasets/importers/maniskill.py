@@ -5,8 +5,6 @@ Each ``traj_i`` holds T actions and, where observations were recorded, T + 1 of 
 reading) and ``obs/sensor_param/CAMERA/{intrinsic_cv, extrinsic_cv}`` (world to camera, OpenCV axes).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any

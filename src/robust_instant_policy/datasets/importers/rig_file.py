@@ -1,7 +1,5 @@
 """A `Rig` in a JSON file, for the command line."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path

@@ -5,8 +5,6 @@ Each ``data/demo_i`` holds ``actions (T, D)``, ``obs/robot0_eef_pos`` and ``obs/
 (metres); its attribute ``camera_info`` gives each camera's intrinsics and its pose in the world, OpenCV axes.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

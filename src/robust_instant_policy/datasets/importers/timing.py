@@ -1,7 +1,5 @@
 """Frames at uneven times, or with the time of day: resampled to the rate of a demonstration."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 

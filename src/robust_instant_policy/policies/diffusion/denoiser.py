@@ -1,7 +1,5 @@
 """Actions out of noise: the model that trained policies share, its training loss, and sampling from it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

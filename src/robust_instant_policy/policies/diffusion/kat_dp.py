@@ -3,8 +3,6 @@
 The method of the paper's comparison (Di Palo and Johns 2024; Oh et al. 2025, Sec. V-A.2).
 """
 
-from __future__ import annotations
-
 from typing import Any, Self
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Training that can be stopped at any moment and resumed with the same result, to the bit."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass

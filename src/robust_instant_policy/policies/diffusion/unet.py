@@ -4,8 +4,6 @@ A 1-D U-Net over time. Every block gets the diffusion step and the observation b
 2018).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

@@ -1,8 +1,6 @@
 """The image encoder of Diffusion Policy: a ResNet-18 from scratch with group norm and spatial softmax (Chi et al. 2023,
 Sec. III-C; the spatial softmax is that of Levine et al. 2016)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from transformers import ResNetConfig, ResNetModel

@@ -1,7 +1,5 @@
 """The ChArUco board: its print, and its corners in an image."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass
 from typing import Any

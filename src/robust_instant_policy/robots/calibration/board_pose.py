@@ -1,7 +1,5 @@
 """Pose of a board in the camera's frame, and the scale that a depth image gives to it."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Calibration of a fixed camera, from a board on the table or in the hand, and its file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Calibrations with a person: touching, holding and photographing the board, copying joints."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ With the hand's poses H_i (hand -> world, from the robot), the board's poses C_i
 unknown camera X (camera -> world) and mounting Y (board -> hand):  H_i Y = X C_i.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Its first place is known. The others need not be: that the board lies in the sam
 which one small board seen from above does not (0.1 px at a corner is half a degree).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 The hand's frame is the tool frame of the arm's model, which the measured one corrects.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

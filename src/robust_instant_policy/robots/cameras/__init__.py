@@ -1,7 +1,5 @@
 """RGB-D cameras, each behind the protocol of `robots.camera`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

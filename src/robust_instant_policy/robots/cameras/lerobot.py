@@ -1,7 +1,5 @@
 """A camera of LeRobot, or one of that shape."""
 
-from __future__ import annotations
-
 import time
 from typing import Protocol
 

@@ -7,8 +7,6 @@ colour module ─ rgb  ──┘                └─────────�
 The temporal filter starts anew with each `read`, so that no image is mixed with one from before the arm moved.
 """
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Sequence

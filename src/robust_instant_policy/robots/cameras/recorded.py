@@ -1,7 +1,5 @@
 """A folder of observations, replayed as a camera."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

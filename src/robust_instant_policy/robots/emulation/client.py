@@ -1,7 +1,5 @@
 """Starts the process of an emulated cell, and reads its state."""
 
-from __future__ import annotations
-
 import io
 import json
 import select

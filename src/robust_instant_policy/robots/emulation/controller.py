@@ -5,8 +5,6 @@ RTDE on port 30004 (Universal Robots, "Real-Time Data Exchange guide"), the dash
 done here. Each controller has a loopback address of its own, since the library's ports are fixed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 import socket

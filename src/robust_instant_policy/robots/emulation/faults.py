@@ -1,7 +1,5 @@
 """Faults that an emulated device can be told to have."""
 
-from __future__ import annotations
-
 import random
 import threading
 

@@ -4,8 +4,6 @@
 ``POST /fault/ARM/FAULT``, ``/scene/SEED``.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import sys

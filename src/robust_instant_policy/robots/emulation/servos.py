@@ -1,7 +1,5 @@
 """The nine servos of a ViperX 300 on a pseudo-terminal, which the driver opens like a USB adapter's port."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty

@@ -1,7 +1,5 @@
 """The physics behind emulated devices."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Sequence

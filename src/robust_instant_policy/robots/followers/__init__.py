@@ -1,7 +1,5 @@
 """Arms that execute commands, one file a kind."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import import_module
 

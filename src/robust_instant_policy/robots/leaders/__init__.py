@@ -1,7 +1,5 @@
 """Leaders, each behind the protocol of `robots.leader`: leader arms, a keyboard, a gamepad, a SpaceMouse."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A leader with the joints of its follower: GELLO, ALOHA's leader arms, any `Teleoperator` of LeRobot."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Leader arms of Dynamixel servos, moved by a person with the torque off."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

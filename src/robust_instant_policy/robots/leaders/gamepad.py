@@ -1,7 +1,5 @@
 """A gamepad through Linux' joystick interface (``/dev/input/js0``)."""
 
-from __future__ import annotations
-
 import os
 import struct
 

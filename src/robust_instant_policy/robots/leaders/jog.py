@@ -1,7 +1,5 @@
 """Leaders that move the tool by steps: a keyboard, a gamepad or a SpaceMouse."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Protocol
 

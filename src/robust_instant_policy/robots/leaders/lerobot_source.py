@@ -1,7 +1,5 @@
 """A `Teleoperator` of LeRobot, or an object of that shape."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 

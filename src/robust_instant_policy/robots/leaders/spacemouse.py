@@ -1,7 +1,5 @@
 """A SpaceMouse, through `pyspacemouse` and the system's HIDAPI."""
 
-from __future__ import annotations
-
 import math
 import time
 from typing import Any

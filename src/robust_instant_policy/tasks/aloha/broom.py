@@ -1,7 +1,5 @@
 """Tools for sweeping: a brush with an upright handle, and a dustpan."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

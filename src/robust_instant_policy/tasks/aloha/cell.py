@@ -4,8 +4,6 @@ The world's origin lies on the table, midway between the arms; x points from the
 image's top points along +x.
 """
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import gymnasium

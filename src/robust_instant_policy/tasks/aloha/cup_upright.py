@@ -1,7 +1,5 @@
 """Grasp a lying cup and stand it upright."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

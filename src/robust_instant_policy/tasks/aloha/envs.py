@@ -1,7 +1,5 @@
 """Importing this module registers the environments with gymnasium: ``gymnasium.make("RIP-AlohaSweep-v1")``."""
 
-from __future__ import annotations
-
 import gymnasium
 
 MAX_EPISODE_STEPS = 3000  # a minute

@@ -1,7 +1,5 @@
 """Hang a clothes hanger on a level rod."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Pick a banana from the table and hold it up."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Put a bottle into a red bowl."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

@@ -4,8 +4,6 @@ MuJoCo selects one library at import, and PyOpenGL cannot change the first one i
 separate process. ``python -m`` this module prints the selection.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import subprocess

@@ -5,8 +5,6 @@ the fingers' convex hulls; both are replaced here: position drives with the torq
 servos (Trossen Robotics lists the servo of each joint), and flat pads at the contact areas of the fingers.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import gym_aloha

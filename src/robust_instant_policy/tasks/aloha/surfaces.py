@@ -1,7 +1,5 @@
 """Parts of objects: textured visual meshes, and collision shapes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Sweep an object into a dustpan: one gripper holds the pan, the other the brush."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import mujoco

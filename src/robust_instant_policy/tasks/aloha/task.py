@@ -1,7 +1,5 @@
 """The five tasks of the ALOHA cell as `tasks.task.Task`."""
 
-from __future__ import annotations
-
 import gymnasium
 
 import robust_instant_policy.tasks.aloha.envs  # noqa: F401  (registers them)

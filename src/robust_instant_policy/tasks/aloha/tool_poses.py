@@ -1,7 +1,5 @@
 """Tool poses for the experts of the ALOHA tasks."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from robust_instant_policy.geometry import FloatArray, make_pose

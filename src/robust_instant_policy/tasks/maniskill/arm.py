@@ -1,7 +1,5 @@
 """The UR5e with the Hand-E gripper for motion planning."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike

@@ -1,7 +1,5 @@
 """Boxes on the table of the cell: what is stacked, sorted and wiped."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """A sensor of a ManiSkill environment as a calibrated RGB-D camera, and the ground truth of its pixels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Links made of boxes and cylinders, with equal visual and collision shapes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

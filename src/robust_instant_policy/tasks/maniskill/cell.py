@@ -3,8 +3,6 @@
 The world's origin is on the table top, x away from the robot, z up. The image's top points along +x.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

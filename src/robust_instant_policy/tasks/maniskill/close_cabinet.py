@@ -1,7 +1,5 @@
 """Push the open door of a small cabinet closed."""
 
-from __future__ import annotations
-
 import numpy as np
 from mani_skill.utils.registration import register_env
 

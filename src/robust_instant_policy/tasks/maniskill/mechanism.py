@@ -3,8 +3,6 @@
 All positions are in the object's frame: on the table, z up, its -x side facing the robot at yaw 0.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import sapien

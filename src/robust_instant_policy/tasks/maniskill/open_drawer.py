@@ -1,7 +1,5 @@
 """Pull a drawer of a small chest open by its handle."""
 
-from __future__ import annotations
-
 import numpy as np
 from mani_skill.utils.registration import register_env
 

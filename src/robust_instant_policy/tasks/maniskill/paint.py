@@ -1,7 +1,5 @@
 """Materials of surfaces: paint, metal, wood grain."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

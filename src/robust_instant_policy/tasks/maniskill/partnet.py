@@ -3,8 +3,6 @@
 The geometry that experts need is measured on their meshes. PartNet-Mobility's objects face -x, as ours do.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Pick a banana from the table and hold it up."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

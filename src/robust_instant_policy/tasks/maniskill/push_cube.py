@@ -1,7 +1,5 @@
 """Push a cube into a goal disc: the scene and rules of ManiSkill's PushCube-v1, with the UR5e."""
 
-from __future__ import annotations
-
 import numpy as np
 import sapien
 import torch

@@ -1,7 +1,5 @@
 """Push a cube into a goal disc that lies anywhere around it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

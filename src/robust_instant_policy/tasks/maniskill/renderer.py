@@ -1,7 +1,5 @@
 """Test whether SAPIEN can render. ``python -m`` this module tests it in a separate process."""
 
-from __future__ import annotations
-
 import sys
 
 import sapien.render

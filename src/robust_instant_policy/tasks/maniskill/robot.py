@@ -4,8 +4,6 @@
 controller of the real arm: they lag the command by about `DRIVE_LAG_S` and saturate at the joints' torque limits.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import ClassVar
 

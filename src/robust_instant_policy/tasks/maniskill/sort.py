@@ -1,7 +1,5 @@
 """Put the nearer of two blocks into a tray."""
 
-from __future__ import annotations
-
 import numpy as np
 import sapien
 from mani_skill.utils.registration import register_env

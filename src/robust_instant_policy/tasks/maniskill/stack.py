@@ -1,7 +1,5 @@
 """Stack a cube on another one of any size."""
 
-from __future__ import annotations
-
 import numpy as np
 import sapien
 from mani_skill.utils.registration import register_env

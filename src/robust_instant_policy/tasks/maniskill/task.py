@@ -1,7 +1,5 @@
 """The tasks of the ManiSkill cell as `tasks.task.Task`."""
 
-from __future__ import annotations
-
 import gc
 from typing import Any
 

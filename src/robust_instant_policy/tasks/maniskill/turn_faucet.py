@@ -1,7 +1,5 @@
 """Turn a faucet on by its lever."""
 
-from __future__ import annotations
-
 import numpy as np
 from mani_skill.utils.registration import register_env
 

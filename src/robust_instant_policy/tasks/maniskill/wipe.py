@@ -1,7 +1,5 @@
 """Wipe a bar of any length from its first end to the other."""
 
-from __future__ import annotations
-
 import numpy as np
 import sapien
 from mani_skill.utils.registration import register_env

@@ -1,7 +1,5 @@
 """ManiSkill's own tasks of the Panda that need no download."""
 
-from __future__ import annotations
-
 from robust_instant_policy.tasks.benchmark import Benchmark
 
 PREFIX = "maniskill/"

@@ -1,7 +1,5 @@
 """An environment of ManiSkill, unchanged, as `simulated_task.Cell`, with an RGB-D camera of ours."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 Tool frames are those of `poses.downward`: the fingers close along y, x is across them.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

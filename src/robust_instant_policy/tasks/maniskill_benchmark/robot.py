@@ -1,7 +1,5 @@
 """The Panda of ManiSkill's tasks for motion planning."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import mani_skill

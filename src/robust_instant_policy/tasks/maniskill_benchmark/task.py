@@ -1,7 +1,5 @@
 """ManiSkill's own Panda tasks, ``maniskill/NAME``, as `tasks.task.Task`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

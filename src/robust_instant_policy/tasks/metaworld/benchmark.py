@@ -1,7 +1,5 @@
 """Meta-World's fifty tasks: their names, their groups of difficulty, and what others published."""
 
-from __future__ import annotations
-
 from robust_instant_policy.tasks.benchmark import Benchmark
 
 PREFIX = "metaworld/"

@@ -3,8 +3,6 @@
 The package pins an older MuJoCo, whose rows of ``eq_data`` are shorter; one method is replaced for the newer ones.
 """
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -4,8 +4,6 @@ The hand is moved as the benchmark moves it, by a mocap body and at most 10 mm a
 so the rotation of a trajectory's triplets is not followed. A task is done if the environment says so at any step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
