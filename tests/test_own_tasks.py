@@ -47,6 +47,16 @@ class Bare:
     def execute(self, trajectory, on_frame=None):
         return Execution(False, "it never does")
 '''
+TELLING = '''
+from robust_instant_policy.tasks.template import PlaceBlock
+
+class Telling(PlaceBlock):
+    """Execute tells less than it must."""
+    def execute(self, trajectory, on_frame=None):
+        return True
+    def demonstrate(self, seed):
+        return PlaceBlock().demonstrate(seed)
+'''
 
 
 @pytest.fixture
@@ -83,12 +93,23 @@ def test_a_task_and_keypoints_of_ones_own_are_evaluated(folder, capsys):
 
 
 def test_a_defect_in_keypoints_of_ones_own_is_a_failed_plan_and_not_the_end_of_the_run(folder, in_this_process, capsys):
-    (folder / "broken.py").write_text("class Broken:\n    def locate(self, observation):\n        return 1 / 0\n")
+    (folder / "broken.py").write_text(
+        "class Broken:\n    def locate(self, observation):\n        raise OSError('no camera')\n"
+    )
     command = "eval --tasks robust_instant_policy.tasks.template:PlaceBlock --methods neighbours --demos 3 --episodes 2"
     assert main([*command.split(), "--keypoints", "broken:Broken", "--out", "run"]) == 0
     results = read_results(Path("run"))
-    assert [row.failure for row in results.episodes] == ["no plan: unexpected ZeroDivisionError: division by zero"] * 2
+    assert [row.failure for row in results.episodes] == [
+        "no plan: the keypoints broken:Broken raise OSError: no camera"
+    ] * 2
     assert [failure.stage for failure in results.failures] == ["keypoints"] * 2
+
+
+def test_an_execution_of_another_type_is_told_in_one_line(folder, in_this_process, capsys):
+    (folder / "telling.py").write_text(TELLING)
+    command = "eval --tasks telling:Telling --methods replay --demos 1 --episodes 1 --out run"
+    assert main([*command.split()]) == 2
+    assert "execute(…) of telling:Telling must return Execution, got bool" in capsys.readouterr().err
 
 
 def test_what_a_bare_task_lacks_is_left_out_or_told(folder, in_this_process, capsys):

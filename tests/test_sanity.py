@@ -335,20 +335,25 @@ def test_grasps_beside_or_above_what_the_image_shows_are_doubted():
     assert "above or beside a surface" in doubts((0, 0, 0.04))[0]
 
 
-def test_a_path_that_reaches_as_low_as_the_others_into_a_hole_contradicts_nothing():
-    def lowered(shown, hole):
+def test_paths_into_a_hole_contradict_nothing_and_one_that_reaches_deeper_is_told():
+    def lowered(shown, hole, below=0.05):
         """Into a hole around the block, whose middle the image shows ``hole`` metres beside it."""
         x, y = shown.trajectory.triplets[30, 0, 1:, :2].mean(axis=0)
         rows, cols = np.mgrid[:200, :200] * 0.6 / 300 - 99.5 * 0.6 / 300
         inside = (np.abs(cols - x) < 0.09) & (np.abs(-rows - y - hole) < 0.09) & (shown.observation.depth > 0.59)
         depth = np.where(inside, np.float32(0.7), shown.observation.depth)
         actions = shown.trajectory.actions.copy()
-        actions[:, [2, 5, 8]] -= 0.05 * np.clip((0.15 - actions[:, [5]]) / 0.13, 0, 1)
+        actions[:, [2, 5, 8]] -= below * np.clip((0.15 - actions[:, [5]]) / 0.13, 0, 1)
         trajectory = Trajectory(actions, shown.trajectory.times)
         return replace(shown, observation=replace(shown.observation, depth=depth), trajectory=trajectory)
 
     shown = [lowered(one, 0.14 if index == 3 else 0.0) for index, one in enumerate(grasps(count=5))]
     assert check_demonstrations(shown).findings == ()
+    deeper = grasps(count=5)[3]
+    beside = deeper.trajectory.triplets[30, 0, 1:, :2].mean(axis=0) + np.array([0.05, 0.0])
+    shown[3] = lowered(replace(deeper, observation=block(beside)), 0.14, below=0.08)
+    (told,) = (one for one in check_demonstrations(shown).findings if one.kind == "contradiction")
+    assert told.severity == "warning"
 
 
 @pytest.mark.parametrize("count", [3, 4])

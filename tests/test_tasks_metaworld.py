@@ -55,6 +55,18 @@ def test_what_is_known_projects_where_it_is_rendered(scene):
         assert np.median(away) == pytest.approx(radius, abs=0.006)
 
 
+def test_a_goal_is_drawn_where_success_is_measured_where_the_benchmark_draws_it_elsewhere():
+    task = make_task("metaworld/pick-out-of-hole")
+    try:
+        task.reset(5)
+        truth = task.scene_truth()
+        goal = truth.poses[truth.names.index("site goal")][:3, 3]
+        assert goal == pytest.approx(task._env.env._target_pos)
+        assert (truth.parts == truth.names.index("site goal")).sum() > 10
+    finally:
+        task.close()
+
+
 def test_the_table_is_at_height_zero_to_the_millimetre(scene):
     _, observation, truth = scene
     table = truth.parts == truth.names.index("tablelink")

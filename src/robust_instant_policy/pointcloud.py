@@ -79,7 +79,10 @@ def _largest_plane(points: FloatArray, rng: np.random.Generator) -> FloatArray:
     normals = normals[level] / (np.sign(normals[level, 2]) * lengths[level])[:, None]
     offsets = -(normals * corners[level, 0]).sum(axis=1)
     near = np.abs(points @ normals.T + offsets) < ON_TABLE_M
-    inliers = points[near[:, near.sum(axis=0).argmax()]]
+    best = near.sum(axis=0).argmax()
+    inliers = points[near[:, best]]
+    if len(inliers) < len(corners[0]):  # of points far away, a plane's own corners lie off it by rounding
+        return np.append(normals[best], offsets[best])
     centre = inliers.mean(axis=0)
     normal = np.linalg.eigh(np.cov((inliers - centre).T))[1][:, 0]
     normal = normal * np.sign(normal[2])

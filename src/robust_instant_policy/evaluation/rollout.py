@@ -7,7 +7,7 @@ from functools import partial
 
 from robust_instant_policy.controller import Controller
 from robust_instant_policy.demonstration import Observation
-from robust_instant_policy.errors import RipError, UnreachableError
+from robust_instant_policy.errors import RipError, UnreachableError, UsageError
 from robust_instant_policy.evaluation.episodes import Episode
 from robust_instant_policy.evaluation.variant import Scene, Variant
 from robust_instant_policy.geometry import FloatArray
@@ -84,9 +84,13 @@ def roll_out(
 def execute(task: Task, trajectory: Trajectory, on_frame: FrameSink | None = None) -> Execution:
     """Execute ``trajectory`` in the task's scene; a trajectory that the motion checks refuse is a failed execution."""
     try:
-        return task.execute(trajectory, on_frame)
+        execution = task.execute(trajectory, on_frame)
     except UnreachableError as error:
         return Execution(success=False, failure=f"refused: {error}", seconds=0.0, tracking_error=0.0)
+    if not isinstance(execution, Execution):  # of a user's task
+        got = type(execution).__name__
+        raise UsageError(f"execute(…) of {task.name} must return Execution, got {got}; try rip new-task --check")
+    return execution
 
 
 def _follow(task: Task, policy: ClosedLoopPolicy, observation: Observation, row: partial[Episode]) -> Episode:

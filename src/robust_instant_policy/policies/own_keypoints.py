@@ -1,13 +1,13 @@
 """Keypoints of one's own: from a tracker, fiducial markers or a pose estimator."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robust_instant_policy.demonstration import Demonstration, Observation
-from robust_instant_policy.errors import InvalidValueError, KeypointError, UsageError
+from robust_instant_policy.errors import InvalidValueError, KeypointError, RipError, UsageError
 from robust_instant_policy.geometry import FloatArray, as_numbers, project
 from robust_instant_policy.perception import Located
 from robust_instant_policy.plugins import load_class
@@ -31,7 +31,7 @@ class KeypointSource(Protocol):
 class OwnKeypoints:
     """A `KeypointSource` in the place of `perception.KeypointExtractor`, with the same results of `fit` and `locate`.
 
-    Raises `UsageError` for a source without `locate`.
+    Raises `UsageError` for a source without `locate`; whatever the source itself raises is a `KeypointError`.
     """
 
     def __init__(self, source: str | KeypointSource):
@@ -45,9 +45,9 @@ class OwnKeypoints:
         `KeypointError` where one is missing."""
         scenes = [one.observation for one in demonstrations]
         if callable(fit := getattr(self.source, "fit", None)):
-            keypoints, confidence = _separated(fit(demonstrations), 3)
+            keypoints, confidence = _separated(self._asked(fit, demonstrations), 3)
         else:
-            found = [_separated(self.source.locate(scene), 2) for scene in scenes]
+            found = [_separated(self._asked(self.source.locate, scene), 2) for scene in scenes]
             if len({points.shape for points, _ in found}) > 1:
                 raise InvalidValueError(
                     f"the keypoints {self.name} give another number of points in each demonstration"
@@ -65,11 +65,19 @@ class OwnKeypoints:
 
     def locate(self, observation: Observation) -> Located:
         """See `KeypointExtractor.locate`."""
-        keypoints, confidence = _separated(self.source.locate(observation), 2)
+        keypoints, confidence = _separated(self._asked(self.source.locate, observation), 2)
         if len(keypoints) != self.keypoints_.shape[1]:
             raise InvalidValueError(f"locate returned {len(keypoints)} keypoints, fit {self.keypoints_.shape[1]}")
         self._require_all(keypoints, "the scene")
         return Located(keypoints, _pixels(keypoints, observation), confidence)
+
+    def _asked(self, call: Callable[..., Points], given: object) -> Points:
+        try:
+            return call(given)
+        except RipError:
+            raise
+        except Exception as error:  # of the user's code, or of the camera behind it
+            raise KeypointError(f"the keypoints {self.name} raise {type(error).__name__}: {error}") from error
 
     def _require_all(self, keypoints: FloatArray, where: str) -> None:
         missing = np.flatnonzero(~np.isfinite(keypoints).all(axis=1))

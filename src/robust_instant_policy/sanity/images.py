@@ -169,12 +169,14 @@ def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
     """Single demonstrations whose path does not fit their image while the others' do.
 
     What most do is no contradiction: one may reach as low as they do, as into a hole of which its image shows less.
+    Where most reach below the table, as into a hole, one that reaches deeper is only told.
     """
     if len(views) < MIN_DEMONSTRATIONS:
         return []
     likeness = as_is.surroundings.likeness
     usual = float(np.median(likeness))
-    low = np.median([c.least_height for c in as_is.contacts]) - BELOW_TABLE_M
+    usual_height = float(np.median([c.least_height for c in as_is.contacts]))
+    low, into_hole = usual_height - BELOW_TABLE_M, usual_height < -BELOW_TABLE_M
     deep = np.median([c.buried for c in as_is.contacts]) + BELOW_TABLE_M
     found = []
     for index, (c, view) in enumerate(zip(as_is.contacts, views, strict=True)):
@@ -191,7 +193,7 @@ def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
             "above the table, and it is "
             f"{likeness[index]:.2f} like the others ({usual:.2f}); look at it, and remove it if it is wrong"
         )
-        severity: Severity = "error" if apart or (below and likeness[index] < ALIKE) else "warning"
+        severity: Severity = "error" if apart or (below and not into_hole and likeness[index] < ALIKE) else "warning"
         numbers = {"demonstration": float(index), "path_gap": c.path, "likeness": float(likeness[index])}
         found.append(Finding("contradiction", severity, words, numbers, f"demonstration {index}"))
     return found

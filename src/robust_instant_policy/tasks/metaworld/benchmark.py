@@ -41,7 +41,8 @@ METAWORLD = Benchmark(
         "told the task in words, and act in closed loop on colour images in which the robot is seen (SmolVLA's table). "
         "Ours sees demonstrations of the one task only, is told no words, plans once from one RGB-D image of the "
         "start, from a calibrated camera that does not see the robot, and executes open loop; goals without a body are "
-        "drawn as the benchmark draws them. Both use the benchmark's own scripted demonstrators, random positions, "
+        "drawn as the benchmark draws them (that of pick-out-of-hole, which it draws at the object, where success is "
+        "measured). Both use the benchmark's own scripted demonstrators, random positions, "
         "measure of success (at any step) and horizon of 500 steps."
     ),
 )

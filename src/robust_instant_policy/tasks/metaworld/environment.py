@@ -61,7 +61,7 @@ class Environment:
         env.reset()
         env._freeze_rand_vec = True  # a reset draws twice; the benchmark keeps the second
         self._seen = env.reset()[0]
-        self._place_goals()
+        mujoco.mj_forward(self.model, self.data)
         self.success, self.steps = False, 0
         self.expert = self._policy()
 
@@ -95,6 +95,7 @@ class Environment:
 
     def photograph(self) -> Observation:
         """What the depth camera sees; the robot is not drawn."""
+        self._place_goals()
         rgb, depth = self._images.rgb(_camera(), SIZE_PX), self._images.depth(_camera(), SIZE_PX)
         return Observation(rgb, depth, pinhole(SIZE_PX, self.model.vis.global_.fovy), _camera_pose())
 
@@ -123,9 +124,14 @@ class Environment:
         self.env.close()
 
     def _place_goals(self) -> None:
-        """Goals without a body are sites, which the benchmark puts where they belong after every step."""
-        mujoco.mj_forward(self.model, self.data)
-        for site, place in self.env._target_site_config:
+        """Goals without a body are sites, which the benchmark puts where they belong after every step.
+
+        Only in pick-out-of-hole it puts its one site elsewhere: at the object, so that nothing shows the goal.
+        """
+        sites, target = self.env._target_site_config, self.env._target_pos
+        if sites and not any(np.allclose(place, target) for _, place in sites):
+            sites = [(sites[0][0], target)]
+        for site, place in sites:
             self.env._set_pos_site(site, place)
 
 
