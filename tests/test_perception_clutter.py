@@ -8,7 +8,8 @@ import pytest
 
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.geometry import GripperTriangle, make_pose, project
-from robust_instant_policy.perception import KeypointExtractor
+from robust_instant_policy.perception import KeypointExtractor, matching
+from robust_instant_policy.perception.relevance import relevances
 from robust_instant_policy.perception.view import make_view
 from robust_instant_policy.policies.context import build_context
 from robust_instant_policy.policies.settings import Settings
@@ -382,9 +383,50 @@ def test_an_object_of_another_size_has_less_confidence_and_an_unusual_stretch_sp
     same, longer = (extractor.locate(scene(7, long)[0]).confidence.mean() for long in (0.04, 0.06))
     assert longer < 0.7 * same
     surroundings = extractor.objects_[0].model.surroundings
-    unseen = np.zeros((2, len(surroundings.cells)), dtype=np.int8)
-    usual, exchanged = surroundings.log_chance_of(unseen, np.array([[0.0, 0.0], [0.3, -0.3]]))
+    unseen = np.zeros((3, len(surroundings.cells)), dtype=np.int8)
+    sizes = np.array([[0.0, 0.0, 0.0], [0.3, -0.3, 0.0], [0.0, 0.0, 0.3]])
+    usual, exchanged, lifted = surroundings.log_chance_of(unseen, sizes)
     assert usual - exchanged > 3
+    assert usual - lifted > 3
+
+
+def test_what_no_other_image_shows_takes_no_place_from_what_has_keypoints():
+    rng = np.random.default_rng(0)
+
+    def scene(seed: int):
+        (x, y), (a, b), (c, d) = places(seed, 3)
+        others = [(a, b, 0.04, 0.06), (c, d, 0.035, 0.05)]
+        strangers = [(*one, tuple(map(tuple, rng.integers(0, 256, (2, 3))))) for one in others]
+        return photograph([(x, y, 0.03, 0.05, COLOURS[0]), *strangers]), path_to(x, y)
+
+    extractor = KeypointExtractor(4, features="efficientnet")
+    extractor.fit(*map(list, zip(*map(scene, range(5)), strict=True)))
+    assert len(extractor.objects_) == 1
+
+
+def test_a_demonstration_that_shows_no_object_at_all_is_no_crash():
+    spots = places(0, 4)
+    thing = [np.array([[x, y, 0.05], [x, y + 0.01, 0.05]]) for x, y in spots]
+    paths = [path_to(x, y) for x, y in spots]
+    assert relevances([thing], paths)[0] > 0
+    assert relevances([[None, *thing[1:]]], paths)[0] > 0
+
+
+def test_the_rest_of_a_thing_is_no_second_one(monkeypatch):
+    scenes = [(photograph(blocks), path_to(*blocks[0][:2])) for blocks in map(blocks_at, range(3))]
+    extractor = KeypointExtractor(4, features="efficientnet").fit(*map(list, zip(*scenes, strict=True)))
+    view = extractor._view(scenes[2][0])
+    models = [thing.model for thing in extractor.objects_]
+    there = [thing.registrations[2] for thing in extractor.objects_]
+
+    def second(shift: float):
+        moved = replace(there[0], pose=make_pose(np.eye(3), [shift, 0, 0]) @ there[0].pose)
+        monkeypatch.setattr(matching, "register", lambda *_, **__: moved)
+        nowhere = [replace(one, pose=make_pose(np.eye(3), [9, 0, 0]) @ one.pose) for one in there[1:]]
+        return matching.find_again(models, [there[0], *nowhere], view, [0])
+
+    assert list(second(0.2)) == [0]
+    assert second(0.015) == {}
 
 
 def test_the_context_holds_the_demonstrations_that_show_the_grasped_thing():

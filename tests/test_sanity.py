@@ -356,6 +356,17 @@ def test_paths_into_a_hole_contradict_nothing_and_one_that_reaches_deeper_is_tol
     assert told.severity == "warning"
 
 
+@pytest.mark.parametrize("count", [3, 4])
+def test_one_of_few_demonstrations_that_does_not_show_the_thing_contradicts_the_others(count):
+    shown = grasps(count=count)
+    assert not check_demonstrations(shown).findings
+    depth = shown[1].observation.depth
+    empty = replace(shown[1].observation, depth=np.full_like(depth, depth.max()))
+    for observation, words in ((empty, "shows nothing above"), (block((0.2, 0.2), (0.05, 0.05, 0.05)), "no nearer")):
+        with pytest.raises(DemonstrationError, match=f"demonstration 1 contradicts the others: .*{words}"):
+            check_demonstrations([shown[0], replace(shown[1], observation=observation), *shown[2:]]).raise_if_wrong()
+
+
 def test_surroundings_that_repeat_little_but_only_with_their_own_image_are_no_error():
     rng = np.random.default_rng(0)
     shown = []

@@ -42,14 +42,14 @@ def surface_depth(depth: Float32Array, pixels: ArrayLike) -> FloatArray:
 
 
 def lift_to_surface(
-    observation: Observation, depth: Float32Array, points: FloatArray
+    observation: Observation, depth: Float32Array, points: FloatArray, reach: ArrayLike = MAX_LIFT_M
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """``points (N, 3)``, metres, world, moved along their rays onto the surface in ``depth (H, W)``, metres.
 
-    Also their pixels ``(N, 2)`` and which have a surface within `MAX_LIFT_M`; the others stay where they are.
+    Also their pixels ``(N, 2)`` and which have a surface within ``reach``, metres; the others stay where they are.
     """
     pixels = project(points, observation.intrinsics, observation.camera_pose)
     found = surface_depth(depth, pixels)
     lifted = lift(pixels, np.nan_to_num(found), observation.intrinsics, observation.camera_pose)
-    measured = np.isfinite(found) & (np.linalg.norm(lifted - points, axis=1) < MAX_LIFT_M)
+    measured = np.isfinite(found) & (np.linalg.norm(lifted - points, axis=1) < reach)
     return np.where(measured[:, None], lifted, points), pixels, measured

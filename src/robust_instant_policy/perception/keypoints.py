@@ -14,14 +14,20 @@ from threadpoolctl import threadpool_limits
 from robust_instant_policy.demonstration import Observation
 from robust_instant_policy.errors import InvalidValueError, KeypointError, UnknownNameError
 from robust_instant_policy.geometry import FloatArray, project, transform_points
-from robust_instant_policy.perception.depth import lift_to_surface
+from robust_instant_policy.perception.depth import MAX_LIFT_M, lift_to_surface
 from robust_instant_policy.perception.descriptors import DescriptorNetwork
 from robust_instant_policy.perception.matching import certainty, find_again, plausibility, register_all
-from robust_instant_policy.perception.models import MAX_MISSING, MIN_FITNESS, Registration, RigidObject
+from robust_instant_policy.perception.models import (
+    MAX_MISSING,
+    MIN_FITNESS,
+    SAME_THING_FITNESS,
+    Registration,
+    RigidObject,
+)
 from robust_instant_policy.perception.nearest import Image, SharedDescriptors, share_descriptors
 from robust_instant_policy.perception.network import choose_network
 from robust_instant_policy.perception.objects import find_objects, segmentation, without
-from robust_instant_policy.perception.registration import RESIDUAL_M, register_translation
+from robust_instant_policy.perception.registration import MAX_STRETCH, RESIDUAL_M, register_translation
 from robust_instant_policy.perception.relevance import hand_places, reference, relevances, shares, still
 from robust_instant_policy.perception.selection import best_buddies, select_points
 from robust_instant_policy.perception.settings import DescriptorSettings, paper_settings
@@ -30,7 +36,7 @@ from robust_instant_policy.trajectory import Trajectory
 
 CORRESPONDENCES = ("registration", "nearest")
 SAME_SHAPE_FITNESS = 0.7  # from which keypoints need no registration of their own
-SAME_LOOK = 0.85  # of an object's score, that a second thing in what is left of the image has if it looks the same
+OTHER_SIZE = 2.0  # times as far may the surface be from where it is expected, if objects differ in size
 SCENERY_WEIGHT = 0.2  # of what never moves, beside what does
 HAND_SHOWN = 0.8  # share of the images from which on what lies at the start of the path is a hand
 NEIGHBOURHOOD_M = 0.04  # around a keypoint, for a registration of its own
@@ -152,6 +158,14 @@ class KeypointExtractor:
             notes.append(
                 f"{len(self.objects_)} objects were found for {self.num_keypoints} keypoints; {left} of them have none"
             )
+        with_keypoints = {i for number in np.flatnonzero(counts) for i in (number, self.objects_[number].model.parent)}
+        # What has no keypoints and is hardly recognised only takes the place of what has.
+        dropped = [
+            number not in with_keypoints and thing.typical_fitness < SAME_THING_FITNESS
+            for number, thing in enumerate(self.objects_)
+        ]
+        self.objects_ = without(self.objects_, dropped)
+        counts = [count for count, drop in zip(counts, dropped, strict=True) if not drop]
         self._places = []  # of each object's keypoints, in the first image
         buddies = best_buddies(views)
         for thing, count in zip(self.objects_, counts, strict=True):
@@ -217,14 +231,13 @@ class KeypointExtractor:
         notes, doubled = list(located.notes), []
         chosen = [number for number, places in enumerate(self._places) if len(places)]
         for number, second in find_again(models, registrations, view, chosen).items():
-            if second.score > SAME_LOOK * registrations[number].score:
-                doubled.append(number)
-                place = transform_points(second.motion, models[number].points.mean(axis=0))
-                col, row = project(place[None], view.observation.intrinsics, view.observation.camera_pose)[0]
-                notes.append(
-                    f"warning: a second thing, at pixel ({col:.0f}, {row:.0f}), looks like object {number}, which has "
-                    "keypoints: take it away if it is not the one that is meant"
-                )
+            doubled.append(number)
+            place = transform_points(second.motion, models[number].points.mean(axis=0))
+            col, row = project(place[None], view.observation.intrinsics, view.observation.camera_pose)[0]
+            notes.append(
+                f"warning: a second thing, at pixel ({col:.0f}, {row:.0f}), looks like object {number}, which has "
+                "keypoints: take it away if it is not the one that is meant"
+            )
         return replace(located, notes=tuple(notes), doubled=tuple(doubled))
 
     def _view(self, observation: Observation) -> View:
@@ -234,14 +247,16 @@ class KeypointExtractor:
         """The keypoints of objects with known ``registrations`` in ``view``."""
         triples = list(zip(self.objects_, self._places, registrations, strict=True))
         expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
-        points, pixels, measured = lift_to_surface(view.observation, view.depth, expected)
         counts = [len(places) for places in self._places]
+        # An object of another size has its surface further from where it is expected.
+        looseness = np.repeat([OTHER_SIZE if t.model.varies else 1.0 for t in self.objects_], counts)
+        points, pixels, measured = lift_to_surface(view.observation, view.depth, expected, MAX_LIFT_M * looseness)
         quality = [found.fitness * found.similarity * plausibility(t.model, found, view) for t, _, found in triples]
         confidence = np.repeat(quality, counts)
         confidence *= np.concatenate(
             [certainty(t.model, found, view, places) for t, places, found in triples if len(places)]
         )
-        confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / RESIDUAL_M**2)
+        confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / (RESIDUAL_M * looseness) ** 2)
         confidence[~measured] /= 2
         notes = list(view.notes)
         for k in np.flatnonzero(~measured):
@@ -284,6 +299,10 @@ def _weights(
 def _expected_places(view: View, thing: RigidObject, places: FloatArray, found: Registration) -> FloatArray:
     """Where ``places (k, 3)`` of an object in the first image are in ``view``, metres, world."""
     expected = transform_points(found.motion, places)
+    lowest, highest = thing.points[:, 2].min(), thing.points[:, 2].max()
+    lift = found.motion[2, 3]  # of its top; unless the whole thing is lifted, its base stays on the table
+    if thing.model.varies and thing.model.parent < 0 and abs(lift) < (MAX_STRETCH - 1) * (highest - lowest):
+        expected[:, 2] -= lift * ((highest - places[:, 2]) / (highest - lowest)).clip(0, 1)
     if thing.model.varies or found.fitness >= SAME_SHAPE_FITNESS:
         return expected
     # An object of another size or articulation: register the neighbourhood of each keypoint.

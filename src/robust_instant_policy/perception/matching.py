@@ -20,9 +20,11 @@ from robust_instant_policy.perception.models import (
 from robust_instant_policy.perception.registration import (
     COLOUR_CAP_M,
     Candidates,
+    Loss,
     find_rivals,
     fit_shape,
     horizontal_axes,
+    no_loss,
     refine,
     refine_pose,
     rotated,
@@ -50,6 +52,7 @@ MUCH_BETTER = 0.05  # of the score, by which an object's own registration overru
 MAX_PART_TRAVEL_M = 0.2  # against its object
 MAX_SHARED = 0.3  # of the points that an object explains, with a better registered one,
 MAX_SHARED_BY_PART = 0.6  # and for a part, which touches its object
+SAME_LOOK = 0.85  # of an object's fitness and score, that a second thing in what is left of the image has
 LEFT_OF_TWIN = 0.5  # share of an object's surface that an image shows of a second thing of its look
 
 
@@ -109,13 +112,19 @@ def register_model(
         return register(
             model.templates, view, taken, starts, parent=parent.pose, beside=beside, colour_cap=model.colour_cap
         )
-    alone = register(model.templates, view, taken, starts, colour_cap=model.colour_cap)
+    alone = register(model.templates, view, taken, starts, colour_cap=model.colour_cap, loss=_height_loss(model))
     if model.family:
         family = register(model.family, view, taken, colour_cap=model.colour_cap)
         in_family = register(model.templates, view, taken, family.pose[None], vote=False, colour_cap=model.colour_cap)
         if alone.score <= in_family.score + MUCH_BETTER:
             alone = in_family
     return _decided(model, alone, view)
+
+
+def _height_loss(model: Model) -> Loss:
+    """What an unusual height takes from the score of an object's motions."""
+    around = model.surroundings
+    return no_loss if around is None else lambda motions: RIVAL_SCALE * around.lift_loss(motions)
 
 
 def register(
@@ -127,12 +136,13 @@ def register(
     parent: FloatArray | None = None,
     beside: FloatArray | None = None,
     colour_cap: float = COLOUR_CAP_M,
+    loss: Loss = no_loss,
 ) -> Registration:
     """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world.
 
     From the motions ``starts (S, 4, 4)``, and unless ``vote`` is false from those of matches. A part also starts from
     turns of the pose ``parent (4, 4)`` of its object, and from matches apart from that object's points
-    ``beside (B, 3)``, and stays near it.
+    ``beside (B, 3)``, and stays near it. ``loss``, see `refine`.
     """
     target, free = view.target, np.arange(len(view.cell_points))
     if taken is not None and len(taken):
@@ -160,7 +170,7 @@ def register(
         candidates = candidates[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
     index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
     source, similarity = templates[index].xyzrgb, similarity_in(templates, view, similar)
-    refined = refine(candidates, source, target, similarity, view.hides, colour_cap)
+    refined = refine(candidates, source, target, similarity, view.hides, colour_cap, loss)
     pose = settle_turn(refined.motions[0], source, target, similarity, view.hides, colour_cap)
     return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index, refined.motions[1:])
 
@@ -190,10 +200,11 @@ def _at_pieces(template: Template, view: View, voted: FloatArray, taken: FloatAr
 def find_again(
     models: Sequence[Model], found: Sequence[Registration], view: View, which: Iterable[int]
 ) -> dict[int, Registration]:
-    """Objects ``which`` in what no object explains of ``view``: a second thing of its look has about the score of the
-    first.
+    """Objects ``which`` in what no object explains of ``view``, as far as they fit there about as well as where they
+    were ``found``: second things of the same look.
 
-    Parts are not looked for, nor objects with more points than are left.
+    Parts are not looked for, nor objects with more points than are left. What overlaps with the first thing is a rest
+    of that.
     """
     taken = explained(models, found, range(len(models)))
     left = int((~within(view.target[:, :3], taken, CLAIM_M)).sum()) if len(taken) else len(view.target)
@@ -201,8 +212,14 @@ def find_again(
     for number in which:
         model = models[number]
         size = len(model.templates[found[number].template].surface)
-        if model.parent < 0 and left >= max(MIN_TARGET_POINTS, LEFT_OF_TWIN * size):
-            again[number] = register(model.templates, view, taken, colour_cap=model.colour_cap)
+        if model.parent >= 0 or left < max(MIN_TARGET_POINTS, LEFT_OF_TWIN * size):
+            continue
+        first = found[number]
+        second = register(model.templates, view, taken, colour_cap=model.colour_cap)
+        places, occupied = (transform_points(one.motion, model.points) for one in (second, first))
+        alike = second.fitness > SAME_LOOK * first.fitness and second.score > SAME_LOOK * first.score
+        if alike and within(places, occupied, CLAIM_M).mean() < MAX_TAKEN:
+            again[number] = second
     return again
 
 

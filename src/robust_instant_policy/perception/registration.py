@@ -66,6 +66,12 @@ MAX_STRETCH = 1.4  # factor, and its inverse
 
 Similarity = Callable[[FloatArray], FloatArray]
 Hidden = Callable[[FloatArray], NDArray[np.bool_]]
+Loss = Callable[[FloatArray], FloatArray]
+
+
+def no_loss(motions: FloatArray) -> FloatArray:
+    """Of the score of ``motions (C, 4, 4)``: none ``(C,)``."""
+    return np.zeros(len(motions))
 
 
 def vote_for_motions(source: FloatArray, target: FloatArray, similarities: Float32Array) -> FloatArray:
@@ -119,18 +125,24 @@ class Candidates:
 
 
 def refine(
-    motions: FloatArray, source: Float32Array, target: Float32Array, similarity: Similarity, hidden: Hidden, cap: float
+    motions: FloatArray,
+    source: Float32Array,
+    target: Float32Array,
+    similarity: Similarity,
+    hidden: Hidden,
+    cap: float,
+    loss: Loss = no_loss,
 ) -> Candidates:
     """The best candidates after ICP from ``motions (P, 4, 4)``.
 
     ``source (N, 6)`` and ``target (M, 6)`` are XYZRGB points; ``similarity`` is that of the descriptors under each of
-    several motions, ``hidden`` tells which places ``(..., 3)`` of points something hides. A subset of the points
-    selects `FINALISTS`, all points order them.
+    several motions, ``hidden`` tells which places ``(..., 3)`` of points something hides, ``loss`` what else speaks
+    against motions, of their score. A subset of the points selects `FINALISTS`, all points order them.
     """
     centre = source[:, :3].mean(axis=0)
     starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
     starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M, hidden, cap)
-    score = (fitness + similarity(starts)) / 2
+    score = (fitness + similarity(starts)) / 2 - loss(starts)
     order = np.argsort(-score, kind="stable")
     leading = _distinct(starts, centre, order[score[order] > score.max() - MAX_BEHIND])[:FINALISTS]
     refined = [
@@ -138,7 +150,7 @@ def refine(
     ]
     finalists, fitness = (np.concatenate(parts) for parts in zip(*refined, strict=True))
     similarities = similarity(finalists)
-    order = np.argsort(-fitness - similarities, kind="stable")
+    order = np.argsort(loss(finalists) - (fitness + similarities) / 2, kind="stable")
     return Candidates(finalists[order], fitness[order], similarities[order])
 
 

@@ -96,7 +96,7 @@ def _events(points: Sequence[FloatArray], path: Trajectory) -> FloatArray:
     """Midpoints of the fingertips ``(E, 3)`` in one demonstration, metres, world: where the hand first comes near an
     object's ``points (N, 3)``, where the gripper opens or closes, and at the end; of every arm.
     """
-    nearest = cKDTree(np.concatenate(points))
+    nearest = cKDTree(np.concatenate([np.zeros((0, 3)), *points]))  # of nothing, where no object is shown
     places = []
     for arm in range(0, path.actions.shape[1], ACTION_DIM):
         tips = path.actions[:, arm + 3 : arm + 9].reshape(-1, 2, 3).mean(axis=1)

@@ -2,7 +2,8 @@
 
 A horizontal grid in the object's frame. For each cell the images tell the chance that something stands there: a handle,
 a door or a lever of few points decides, where a mean over all of the object's points would not. Objects that differ in
-size between images also have typical sizes along their two horizontal axes: a wrong turn exchanges these.
+size between images also have typical sizes along their two horizontal axes: a wrong turn exchanges these. And they have
+a typical height: another thing is higher or lower.
 """
 
 from __future__ import annotations
@@ -24,10 +25,12 @@ BLUR_CELLS = 0.7  # standard deviation
 LEAST_CHANCE = 0.12  # that a cell is not as in all images before
 EVIDENCE_SCALE = 8.0  # neighbouring cells of the grid are not independent
 PRIOR_DEVIATION = 0.12  # of the logarithm of a size, before any image,
+LIFT_M = 0.2  # by which an object is higher, that counts like one that is larger by a factor of e
 PRIOR_IMAGES = 2  # that counts like this many
 LEAST_DEVIATION = 2.0  # of the logarithm of the chance, added to that over the images
 UNUSUAL_DEVIATIONS = 3.0  # below what is usual, for a confidence of 1/e
-MAX_SIZE_LOSS = 6.0  # of the logarithm of the chance, for one axis
+UNUSUAL_LIFT_M = 0.02  # above or below where it usually is, for a confidence of 1/e
+MAX_SIZE_LOSSES = 6.0, 6.0, 12.0  # of the logarithm of the chance, for each axis, and for the height
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +38,7 @@ class Surroundings:
     """``evidence_of (3, n)``: for each of n ``cells (n, 2)``, horizontal places in the reference image's world, metres,
     the logarithm of the chance of its state in an image (see `view.Ground`) against that of a coin; whether the motions
     in the images include changes of size, ``stretch``; the object's horizontal ``axes (2, 2)`` as rows, and the median
-    and the deviation ``sizes (2, 2)`` of the logarithms of the factors by which it is larger along them; the same,
+    and the deviation ``sizes (2, 3)`` of how much larger it is along them and how much higher (`log_sizes`); the same,
     ``usual (2,)``, of `log_chance` in the images, where it is known.
     """
 
@@ -69,7 +72,7 @@ class Surroundings:
         axes: FloatArray,
         sizes: FloatArray,
     ) -> Surroundings:
-        """From the ``states (I, n)`` of ``cells (n, 2)`` of a grid of ``shape`` and the `log_sizes` ``(I, 2)`` along
+        """From the ``states (I, n)`` of ``cells (n, 2)`` of a grid of ``shape`` and the `log_sizes` ``(I, 3)`` along
         ``axes (2, 2)`` in I images.
         """
         occupied, free = (states == OCCUPIED).sum(axis=0), (states == FREE).sum(axis=0)
@@ -87,22 +90,34 @@ class Surroundings:
         return self.log_chance_of(shown(self.cells, view, motions), log_sizes(self.axes, motions))
 
     def likeness(self, view: View, motion: FloatArray) -> float:
-        """In [0, 1], less the more `log_chance` at ``motion (4, 4)`` is below what is usual."""
+        """In [0, 1], less the more `log_chance` at ``motion (4, 4)`` is below what is usual, and at another height."""
         if self.usual is None:
             return 1.0
         lack = self.usual[0] - float(self.log_chance(view, motion[None])[0])
-        return float(np.exp(-max(lack, 0) / (UNUSUAL_DEVIATIONS * (self.usual[1] + LEAST_DEVIATION))))
+        lift = LIFT_M * abs(log_sizes(self.axes, motion[None])[0, 2] - self.sizes[0, 2])
+        return float(
+            np.exp(-max(lack, 0) / (UNUSUAL_DEVIATIONS * (self.usual[1] + LEAST_DEVIATION)) - lift / UNUSUAL_LIFT_M)
+        )
 
     def log_chance_of(self, states: NDArray[np.int8], sizes: FloatArray) -> FloatArray:
-        """The same of ``states (C, n)`` of the cells and `log_sizes` ``(C, 2)``."""
+        """The same of ``states (C, n)`` of the cells and `log_sizes` ``(C, 3)``."""
         evidence = self.evidence_of[states, np.arange(len(self.cells))].sum(axis=1) / EVIDENCE_SCALE
-        losses = ((sizes - self.sizes[0]) / self.sizes[1]) ** 2 / 2
-        return np.asarray(evidence - np.minimum(losses, MAX_SIZE_LOSS).sum(axis=1))
+        return np.asarray(evidence - self._size_losses(sizes).sum(axis=1))
+
+    def lift_loss(self, motions: FloatArray) -> FloatArray:
+        """What the height at ``motions (C, 4, 4)`` takes from the logarithm of their chance, ``(C,)``."""
+        return self._size_losses(log_sizes(self.axes, motions))[:, 2]
+
+    def _size_losses(self, sizes: FloatArray) -> FloatArray:
+        return np.minimum(((sizes - self.sizes[0]) / self.sizes[1]) ** 2 / 2, MAX_SIZE_LOSSES)
 
 
 def log_sizes(axes: FloatArray, motions: FloatArray) -> FloatArray:
-    """Logarithms ``(C, 2)`` of the factors by which ``motions (C, 4, 4)`` stretch an object along ``axes (2, 2)``."""
-    return np.asarray(np.log(np.linalg.norm(motions[:, :2, :2] @ axes.T, axis=1)))
+    """Logarithms of the factors by which ``motions (C, 4, 4)`` stretch an object along ``axes (2, 2)``, and by how much
+    they lift it, in units of `LIFT_M`: ``(C, 3)``.
+    """
+    stretched = np.log(np.linalg.norm(motions[:, :2, :2] @ axes.T, axis=1))
+    return np.concatenate([stretched, motions[:, 2:3, 3] / LIFT_M], axis=1)
 
 
 def grid_around(points: FloatArray) -> tuple[FloatArray, tuple[int, int]]:

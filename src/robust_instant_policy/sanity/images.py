@@ -8,7 +8,7 @@ from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.consistency import MIN_DEMONSTRATIONS
 from robust_instant_policy.sanity.contact import GripperPath
-from robust_instant_policy.sanity.finding import Finding, Severity
+from robust_instant_policy.sanity.finding import Finding, Severity, errors
 from robust_instant_policy.sanity.geometry import (
     BELOW_TABLE_M,
     BURIED_M,
@@ -19,6 +19,7 @@ from robust_instant_policy.sanity.geometry import (
     TOUCH_M,
     Evidence,
     Explanation,
+    evidence,
     explain,
     is_above,
     pairing_scores,
@@ -27,7 +28,7 @@ from robust_instant_policy.sanity.view import View
 
 OWN_BETTER = 0.2  # by which the own images' consistency must exceed that of other images,
 ROOM = 0.5  # and less where these leave less than that to the greatest, 1: scenes of which little moves
-DECISIVE, LEAST = 4.0, 0.1  # times other images' consistency, and at least, from which a low one tells them apart
+DECISIVE, LEAST = 3.0, 0.1  # times other images' consistency, and at least, from which a low one tells them apart
 SAME_EVERYWHERE = 0.95  # from which on what is around the gripper looks alike in all scenes, and nothing is told
 CLOSE_M = 0.015  # gap from which a path is compared with other hypotheses, too
 ONE_SCENE_M = 0.01  # spread of the objects below which all demonstrations show one scene
@@ -54,6 +55,12 @@ def check_contact(
     near = np.mean([c.path < CLOSE_M for c in as_is.contacts]) >= MIN_SHARE
     if right and (near or count <= MIN_DEMONSTRATIONS):
         return _outliers(views, as_is)
+    met = [index for index, c in enumerate(as_is.contacts) if c.path <= FAR_FROM_ALL_M]
+    if MIN_SHARE * count < len(met) < count:  # are the others right without those that touch nothing?
+        contradicting = _outliers(views, as_is)
+        of_met = evidence([views[i] for i in met], [paths[i] for i in met], [poses[i] for i in met])
+        if errors(contradicting) and of_met.is_right:
+            return contradicting
     numbers = {
         "path_gap": as_is.path_gap,
         "grasp_gap": as_is.grasp_gap,
@@ -164,7 +171,7 @@ def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
     What most do is no contradiction: one may reach as low as they do, as into a hole of which its image shows less.
     Where most reach below the table, as into a hole, one that reaches deeper is only told.
     """
-    if len(views) < MIN_DEMONSTRATIONS + 1:
+    if len(views) < MIN_DEMONSTRATIONS:
         return []
     likeness = as_is.surroundings.likeness
     usual = float(np.median(likeness))
@@ -178,9 +185,12 @@ def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
         below = c.least_height < low and not is_above(c, view)
         if not (unlike or apart or below or c.buried > max(BURIED_M, deep)):
             continue
+        gap = f"its path comes no nearer than {c.path * 1e3:.0f} mm to a surface"
+        if not len(view.raised_points):
+            gap = "its image shows nothing above the table"
         words = (
-            f"demonstration {index} contradicts the others: its path comes no nearer than {c.path * 1e3:.0f} mm to a "
-            f"surface, its lowest fingertip is {c.lowest * 1e3:.0f} mm above the table, and it is "
+            f"demonstration {index} contradicts the others: {gap}, its lowest fingertip is {c.lowest * 1e3:.0f} mm "
+            "above the table, and it is "
             f"{likeness[index]:.2f} like the others ({usual:.2f}); look at it, and remove it if it is wrong"
         )
         severity: Severity = "error" if apart or (below and not into_hole and likeness[index] < ALIKE) else "warning"
