@@ -126,6 +126,7 @@ def make_plan(
         vote=context.prompt.decide(scene.keypoints)[1],
         doubled=len(scene.located.doubled),
         carried=int(any(finding.severity == "warning" for finding in outside)),
+        recognition=scene.recognition,
         distortion=distortion(context.keypoints, scene.keypoints),
         frames=frames.error,
         prediction=prediction(context.prediction_errors),

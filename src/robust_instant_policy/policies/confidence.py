@@ -1,7 +1,7 @@
 """The confidence of a plan: a calibrated probability that it is right.
 
-    P(right) = min(1, agreement / GOOD_AGREEMENT) · (1 + vote) / 2 · 2^-doubled · `CARRIED`^carried
-               · sigmoid(b_0 + Σ_j b_j f_j)
+    P(right) = min(1, agreement / GOOD_AGREEMENT) · min(1, recognition / GOOD_RECOGNITION) · (1 + vote) / 2 · 2^-doubled
+               · `CARRIED`^carried · sigmoid(b_0 + Σ_j b_j f_j)
 
 The features f_j are made from `Evidence`, f_j <= 0, and are 0 where nothing speaks against the plan; the coefficients
 were fitted to plans for sound and for faulty scenes, all executed in simulated tasks (`benchmarks/confidence.py`,
@@ -37,11 +37,13 @@ WORDS = {
     "demonstrations (theirs differ by {precision_mm:.0f} mm)",
     "doubts": "gripper states, grasps or rotations seem to be recorded wrongly",
     "agreement": "the candidates agree to within 15 mm with a probability of {agreement:.2f} only",
+    "recognition": "the keypoints have {recognition:.2f} of the confidence that counts as recognised",
 }
-"""What each feature says, and the agreement."""
+"""What each feature says, and the agreement and the recognition."""
 
 RECOGNISED = 0.7  # of the least confidence in demonstrations, from which on a scene counts as recognised
 GOOD_AGREEMENT = 0.4  # above which more says nothing: right plans of a small model have 0.4 to 0.9
+GOOD_RECOGNITION = 0.8  # sound scenes have 1; a thing of other colours and size, taken for the one that is meant, 0.4
 # Up to these values evidence says nothing: sound scenes have them.
 GOOD_DISTORTION = 2.0
 GOOD_FRAMES_M, GOOD_PREDICTION_M = 0.010, 0.015
@@ -61,7 +63,8 @@ class Evidence:
     ``agreement`` in [0, 1] of the candidates (`RobustTrajectory.confidence`); ``vote`` in [0, 1] for the way to act
     that was followed, 0 where either of two may be meant (`Prompt.decide`); how many objects with keypoints are
     ``doubled``: of two alike, it is not known which is meant; whether (1, else 0) the plan is ``carried`` beyond what
-    was demonstrated: the demonstrations, carried over into the scene, are so, too; ``distortion`` of the distances
+    was demonstrated: the demonstrations, carried over into the scene, are so, too; ``recognition`` in [0, 1] of the
+    scene (see `recognition`); ``distortion`` of the distances
     between keypoints (see `distortion`); ``frames``, metres, the error with which frames that are fitted to the other
     demonstrations predict one at the gripper change at which they do so worst (`StepFrames.error`), and ``prediction``,
     that of the demonstrations at the key step at which they predict each other best, which stands in for it without
@@ -74,6 +77,7 @@ class Evidence:
     vote: float
     doubled: int
     carried: int
+    recognition: float
     distortion: float
     frames: float
     prediction: float
@@ -99,6 +103,7 @@ class Evidence:
         }
         lowering = [name for name, value in self.features().items() if value < 0]
         lowering += ["agreement"] if self.agreement < GOOD_AGREEMENT else []
+        lowering += ["recognition"] if self.recognition < GOOD_RECOGNITION else []
         told = "; ".join(WORDS[name].format(**values) for name in lowering)
         lowered = (f"warning: the confidence is lowered: {told}",) if told else ()
         return (*lowered, *(() if self.is_known else (UNKNOWN_NOTE,)))
@@ -125,6 +130,7 @@ def plan_confidence(evidence: Evidence, coefficients: Mapping[str, float] = COEF
     agreement, vote = np.nan_to_num(evidence.agreement), np.nan_to_num(evidence.vote, nan=1.0)
     likely = min(1.0, agreement / GOOD_AGREEMENT) * (1 + vote) / 2 * 0.5 ** np.nan_to_num(evidence.doubled)
     likely *= CARRIED ** np.nan_to_num(evidence.carried)
+    likely *= min(1.0, np.nan_to_num(evidence.recognition, nan=1.0) / GOOD_RECOGNITION)
     return float(likely * expit(score) * (1.0 if evidence.is_known else UNKNOWN))
 
 
