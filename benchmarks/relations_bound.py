@@ -65,11 +65,13 @@ class Noted(Hand):
 
 
 def numbers_of(kit: Kit) -> FloatArray:
+    """``(128,)``: 3 shapes of 10 points (90), 6 poses as x, y, z, angle (24), 3 points as x, y (6), 8 shares."""
     poses = [[*pose[:3, 3], np.arctan2(pose[1, 0], pose[0, 0])] for pose in (*kit.grasps, *kit.places)]
     return np.concatenate([kit.shapes.ravel(), np.ravel(poses), kit.points[:, :2].ravel(), kit.shares[2:]])
 
 
 def kit_of(numbers: FloatArray, known: Kit) -> Kit:
+    """The kit of `numbers_of`; what these do not hold is that of the ``known`` one."""
     kit = copy.copy(known)
     shapes, poses, points, shares = np.split(numbers, [90, 114, 120])
     kit.shapes = shapes.reshape(3, 10, 3)
@@ -81,6 +83,7 @@ def kit_of(numbers: FloatArray, known: Kit) -> Kit:
 
 
 def drawn(family: Family, kit: Kit, layout: FloatArray) -> tuple[Drawn, list[FloatArray]]:
+    """The scene of a ``layout``, and the poses ``(4, 4)`` at which the hand aims in it."""
     hand = Noted(None)
     return family.draw(kit, Known(None, layout), hand), hand.poses
 
@@ -126,6 +129,7 @@ def fitted_kit(family: Family, kit: Kit, shown: list, noise_m: float) -> Kit:
 
 
 def errors(family: Family, options: argparse.Namespace, number: int) -> list[float]:
+    """Metres by which the bound's plans are off in the new scenes of set ``number``; see `key_error`."""
     noise_m = options.noise / 1000
     demos = Set(family, options.split, number, options.noise, options.demos)
     stream = family.stream(options.split, number)

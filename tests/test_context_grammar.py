@@ -292,6 +292,25 @@ def test_where_things_are_farther_apart_a_plan_passes_less_surely_and_a_fault_is
     assert plan.confidence == 0  # a metre away no frame supports a plan
 
 
+def test_frames_excuse_distances_alone_and_only_where_they_carry_the_demonstrations_there():
+    keypoints, trajectories, draw = shown("place")
+    policy = Neighbours()
+    policy.fit_context(context_of_keypoints(keypoints, trajectories, policy.settings))
+    keypoints = draw(1000, exact=True).keypoints
+    scene = scene_of_keypoints(keypoints)
+    plan = policy.plan_scene(scene)
+    assert plan.confidence > 0
+    actions = plan.trajectory.actions.copy()
+    actions[:, [0, 3, 6]] += policy.context_.report.envelope.upper[0, 0] + 0.02 - actions[:, [0, 3, 6]].max()
+    aside = Proposal((Trajectory.from_actions(actions),))
+    (told,) = (note for note in take_first(policy.context_, scene, aside).notes if "position" in note)
+    assert told.startswith("error: ")
+    sunk = policy.plan_scene(scene_of_keypoints(keypoints - np.array([0.0, 0.0, 0.05])))
+    (told,) = (note for note in sunk.notes if "too low" in note)
+    assert told.startswith("error: ")
+    assert sunk.confidence == 0
+
+
 def test_changes_of_frame_side_by_side_correct_a_jump_once():
     from robust_instant_policy.context.joins import joined
 

@@ -9,6 +9,7 @@ import pytest
 from robust_instant_policy.demonstration import Demonstration, Observation
 from robust_instant_policy.geometry import GripperTriangle, make_pose, project
 from robust_instant_policy.perception import KeypointExtractor, matching
+from robust_instant_policy.perception.keypoints import _expected_places
 from robust_instant_policy.perception.relevance import relevances
 from robust_instant_policy.perception.view import make_view
 from robust_instant_policy.policies.context import build_context
@@ -388,6 +389,44 @@ def test_an_object_of_another_size_has_less_confidence_and_an_unusual_stretch_sp
     usual, exchanged, lifted = surroundings.log_chance_of(unseen, sizes)
     assert usual - exchanged > 3
     assert usual - lifted > 3
+
+
+def test_a_thing_of_another_height_is_not_taken_for_the_demonstrated_one_and_has_hardly_any_confidence():
+    def scene(seed: int, height: float, paler: int = 0, others: float | None = None):
+        """A block, and one of the colours of the demonstrated ones that is ``others`` metres high."""
+        (x, y), (a, b) = places(seed, 2)
+        colours = tuple(tuple(channel + paler for channel in colour) for colour in COLOURS[0])
+        second = [] if others is None else [(a, b, 0.03, others, COLOURS[0])]
+        return (x, y), photograph([(x, y, 0.03, height, colours), *second])
+
+    shown = [scene(seed, 0.05) for seed in range(5)]
+    extractor = KeypointExtractor(4, features="efficientnet")
+    extractor.fit([image for _, image in shown], [path_to(*place) for place, _ in shown])
+    for seed in range(10, 13):
+        place, image = scene(seed, 0.05, paler=10, others=0.09)
+        assert np.linalg.norm(extractor.locate(image).keypoints[:, :2].mean(axis=0) - place) < 0.02
+        usual, taller = (extractor.locate(scene(seed, height)[1]).confidence.mean() for height in (0.05, 0.08))
+        assert usual > 0.6
+        assert taller < 0.2
+
+
+def test_the_base_of_a_taller_thing_stays_on_the_table_and_that_of_a_lifted_one_does_not():
+    def tower(seed: int, half: float):
+        ((x, y),) = places(seed, 1)
+        return photograph([(x, y, half, 0.02, COLOURS[0]), (x, y, 0.015, 0.06, COLOURS[1])]), path_to(x, y)
+
+    scenes = [tower(seed, 0.03 + 0.005 * seed) for seed in range(5)]
+    extractor = KeypointExtractor(4, features="efficientnet").fit(*map(list, zip(*scenes, strict=True)))
+    (thing,) = extractor.objects_
+    ends = thing.points[[thing.points[:, 2].argmin(), thing.points[:, 2].argmax()]]
+    view, there = extractor._view(scenes[0][0]), thing.registrations[0]
+
+    def risen(lift: float) -> np.ndarray:
+        higher = replace(there, pose=make_pose(np.eye(3), [0, 0, lift]) @ there.pose)
+        return _expected_places(view, thing, ends, higher)[:, 2] - ends[:, 2]
+
+    assert risen(0.01) == pytest.approx([0, 0.01], abs=1e-6)
+    assert risen(0.05) == pytest.approx([0.05, 0.05], abs=1e-6)
 
 
 def test_what_no_other_image_shows_takes_no_place_from_what_has_keypoints():

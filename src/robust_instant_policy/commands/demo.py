@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(f"--demos {options.demos}: the task must be shown at least once")
     if not options.demos.isdecimal():
         open_folder(Path(options.demos), options.task)  # raises before the simulator starts
-    settings = method_settings(options)
+    settings = method_settings(options)  # raises for unknown descriptors
     out = options.out or RUNS / f"{file_stem(options.task)}-{options.seed}"
     if holds_results(out):
         raise UsageError(f"{out} holds an evaluation; choose another folder with --out")

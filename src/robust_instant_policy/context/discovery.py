@@ -72,9 +72,10 @@ def find_things(keypoints: FloatArray, hinges: bool = True) -> list[Thing]:
 
 
 def _clusters(varies: FloatArray, tolerance: float) -> list[tuple[int, ...]]:
-    """Groups of keypoints all of whose distances vary less than ``tolerance``.
+    """Groups of keypoints whose distances vary little, from how much each ``varies (K, K)``, metres.
 
-    A keypoint near a hinge may be of either part: it is counted to that to which its distances vary least.
+    Within a group all distances vary by less than ``tolerance``, metres (complete linkage). Then each keypoint moves to
+    the group to which its distances vary least: near a hinge it suits either part.
     """
     labels = fcluster(linkage(squareform(varies, checks=False), "complete"), tolerance, "distance")
     for _ in range(2):
@@ -216,8 +217,8 @@ def spread(values: FloatArray) -> FloatArray:
 
 
 def _scatter(distances: FloatArray) -> FloatArray:
-    """The same for distances that are noisy alone, of which it makes better use: the biweight (Mosteller and Tukey
-    1977)."""
+    """Standard deviation over the demonstrations of ``distances (I, ...)``, metres: the square root of the biweight
+    midvariance (Mosteller and Tukey 1977), which varies less than `spread` where there is noise without outliers."""
     if len(distances) < DEMOS_FOR_MEDIANS:
         return distances.std(axis=0)
     off = distances - np.median(distances, axis=0)

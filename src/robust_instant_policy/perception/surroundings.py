@@ -84,8 +84,8 @@ class Surroundings:
         return cls(cells, evidence, stretch, axes, np.stack([np.median(sizes, axis=0), deviation]))
 
     def log_chance(self, view: View, motions: FloatArray) -> FloatArray:
-        """Logarithms ``(C,)`` of the chance of what ``view`` shows around the object, and of its size, at ``motions
-        (C, 4, 4)``.
+        """Logarithms ``(C,)`` of the chance of what ``view`` shows around the object, of its size and of its height,
+        at ``motions (C, 4, 4)``.
         """
         return self.log_chance_of(shown(self.cells, view, motions), log_sizes(self.axes, motions))
 

@@ -25,8 +25,8 @@ from robust_instant_policy.regression import RobustTrajectory, robust_gripper_tr
 from robust_instant_policy.sanity import Envelope, Finding, errors
 from robust_instant_policy.trajectory import Trajectory
 
-DISTANCES = {"envelope: position", "envelope: step length", "envelope: path length"}
-FARTHEST = 0.5  # of the longest side of the demonstrated box: farther outside of it, no frame supports a plan
+DISTANCES = {"envelope: position", "envelope: step length", "envelope: path length"}  # the limits that frames excuse
+FARTHEST = 0.5  # of the longest side of the envelope's box, from what was demonstrated; no frame supports more
 STRAY_M = 0.05  # from the demonstrations carried over: a plan that strays farther does not do what they do
 CARRIED_NOTE = "{}; the demonstrations carried over into this scene do the same"
 
@@ -82,11 +82,12 @@ def agree(
 
 
 def _outside(context: Context, keypoints: FloatArray, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """What of ``trajectory`` lies outside of what was demonstrated, each an error.
+    """What of ``trajectory`` lies outside of what was demonstrated: an error, or a warning where frames explain it.
 
-    A warning where it follows the demonstrations as their frames carry them over into the scene of ``keypoints (K,
-    3)``, at every step to `STRAY_M`: things are farther apart there. Only distances may be larger, and places outside
-    by `FARTHEST` at most.
+    They do where it follows the demonstrations, as their frames carry them over into the scene of ``keypoints (K, 3)``,
+    at every step to `STRAY_M`, and these lie outside as well, because things are farther apart there. That excuses
+    `DISTANCES` alone, and places outside by `FARTHEST` at most; never a low fingertip, a turn or another gripper
+    change.
     """
     envelope, prompt = context.report.envelope, context.prompt.for_scene(keypoints)
     found = envelope.check(trajectory) if envelope is not None else ()
@@ -138,7 +139,7 @@ def make_plan(
         agreement=chosen.confidence,
         vote=context.prompt.decide(scene.keypoints)[1],
         doubled=len(scene.located.doubled),
-        carried=int(len(outside) > len(errors(outside))),
+        carried=int(any(finding.severity == "warning" for finding in outside)),
         distortion=distortion(context.keypoints, scene.keypoints),
         frames=frames.error,
         prediction=prediction(context.prediction_errors),
