@@ -48,6 +48,8 @@ def refused(arguments: list[str], capsys) -> tuple[int, str]:
         (["demo", "--demos", "-1"], 2, "--demos -1: the task must be shown at least once"),
         (["demo", "--demos", "absent"], 1, "there is no folder absent"),
         (["demo", "--features", "nosuch"], 1, "no image descriptors 'nosuch'"),
+        (["demo", "--llm", "gguf:absent.gguf"], 1, "no model file at absent.gguf"),
+        (["demo", "--keypoints", "os:nosuch"], 2, "os has no class nosuch"),
         (["eval", "--features", "nosuch", "--out", "x"], 1, "no image descriptors 'nosuch'"),
         (["eval", "--demos", "0", "--out", "x"], 2, "at least 1"),
         (["demo", "--seed", "-1"], 2, "whole number"),

@@ -282,6 +282,10 @@ def test_where_things_are_farther_apart_a_plan_passes_less_surely_and_a_fault_is
             actions[15:20, jump] = fault(actions[15:20, jump], 0.4 if fault is np.add else 2.0)
             wrong = take_first(policy.context_, scene, Proposal((Trajectory.from_actions(actions),)))
             assert any(note.startswith("error: ") for note in wrong.notes)
+        for sign in (-1, 1):  # a little beside what is carried over, at all steps alike
+            beside = plan.trajectory.actions + sign * np.append(np.tile([0.1, 0.0, 0.0], 3), 0)
+            wrong = take_first(policy.context_, scene, Proposal((Trajectory.from_actions(beside),)))
+            assert not any("carried over into this scene do the same" in note for note in wrong.notes)
     assert carried > 2
     elsewhere = draw(1000, exact=True).keypoints + np.array([1.0, 0.0, 0.0])
     plan = policy.plan_scene(scene_of_keypoints(elsewhere))

@@ -285,7 +285,9 @@ class Given:
     [
         (lambda _: np.full((2, 3), np.nan), KeypointError, r"do not find \[0, 1\] in demonstration 0"),
         (lambda _: np.zeros((2, 2)), InvalidValueError, r"must be \(K, 3\)"),
-        (lambda _: (np.zeros((2, 3)), [0.5, 7.0]), InvalidValueError, r"in \[0, 1\]"),
+        (lambda _: (np.zeros((2, 3)), [0.5, 7.0]), InvalidValueError, r"in \[0, 1\], got \[0.5, 7.0\]"),
+        (lambda _: (np.zeros((2, 3)), [0.5] * 3), InvalidValueError, r"must be \(2,\), got \(3,\)"),
+        (lambda _: np.zeros((0, 3)), KeypointError, "give no point in demonstration 0"),
     ],
 )
 def test_keypoints_of_ones_own_that_break_their_contract_are_refused(found, error, told):

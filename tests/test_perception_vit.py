@@ -14,6 +14,7 @@ import torch
 import transformers
 from safetensors.torch import load_file, save_file
 
+from robust_instant_policy.cli import main
 from robust_instant_policy.errors import InvalidValueError, ModelError
 from robust_instant_policy.perception import PAPER_REAL, PAPER_SIMULATION, DescriptorSettings, KeypointExtractor
 from robust_instant_policy.perception.descriptors import DescriptorMap
@@ -341,6 +342,17 @@ def test_without_a_connection_the_hub_is_given_up_within_seconds(monkeypatch, tm
         load_checkpoint("facebook/dino-vits8")
     assert time.monotonic() - start < 8
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("command", [["demo"], ["eval", "--tasks", "push-cube", "--methods", "rip", "--out", "rows"]])
+def test_weights_that_cannot_be_had_are_told_before_anything_is_recorded(command, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.delenv("RIP_DINO_WEIGHTS", raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert main([*command, "--config", "paper", "--llm", "embedded"]) == 1
+    assert "facebook/dino-vits8 are not in the local cache" in capsys.readouterr().err
+    assert not list(tmp_path.glob("data/*"))
 
 
 @pytest.mark.parametrize(

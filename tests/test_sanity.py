@@ -367,6 +367,16 @@ def test_one_of_few_demonstrations_that_does_not_show_the_thing_contradicts_the_
             check_demonstrations([shown[0], replace(shown[1], observation=observation), *shown[2:]]).raise_if_wrong()
 
 
+def test_one_of_two_demonstrations_that_shows_nothing_is_told():
+    shown = grasps(count=2)
+    assert not check_demonstrations(shown).findings
+    depth = shown[1].observation.depth
+    empty = replace(shown[1].observation, depth=np.full_like(depth, depth.max()))
+    report = check_demonstrations([shown[0], replace(shown[1], observation=empty)])
+    assert not errors(report.findings)
+    assert any("demonstration 1 fits its image worse" in note for note in report.notes)
+
+
 def test_surroundings_that_repeat_little_but_only_with_their_own_image_are_no_error():
     rng = np.random.default_rng(0)
     shown = []
@@ -417,6 +427,13 @@ def test_demonstrations_of_one_scene_say_that_others_lie_outside(demonstrations,
     assert not errors(report.findings)
     assert any("one scene" in note for note in report.notes)
     assert report.reference.scene_spread_m < 0.001
+
+
+def test_copies_of_one_demonstration_do_not_make_another_scene_a_moved_camera(demonstrations):
+    noise = CameraNoise()
+    first, second = (noise.photograph(one.observation, i) for i, one in enumerate(demonstrations[:2]))
+    report = check_demonstrations([replace(demonstrations[0], observation=first)] * 3)
+    assert not errors(report.check_observation(second))
 
 
 def test_what_was_demonstrated_lies_inside_its_own_envelope(report, demonstrations):

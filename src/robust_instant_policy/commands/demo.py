@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from robust_instant_policy.commands.console import StageConsole
-from robust_instant_policy.commands.options import DATA, RUNS, add_method, method_settings, seed
+from robust_instant_policy.commands.options import DATA, RUNS, add_method, method_settings, require_keypoints, seed
 from robust_instant_policy.commands.planning import fitted_policy
 from robust_instant_policy.datasets import VideoWriter, load_demonstrations
 from robust_instant_policy.datasets.folder import holds_demonstrations, open_folder
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(f"--demos {options.demos}: the task must be shown at least once")
     if not options.demos.isdecimal():
         open_folder(Path(options.demos), options.task)  # raises before the simulator starts
-    method_settings(options)  # raises for unknown descriptors
+    settings = method_settings(options)  # raises for unknown descriptors
     out = options.out or RUNS / f"{file_stem(options.task)}-{options.seed}"
     if holds_results(out):
         raise UsageError(f"{out} holds an evaluation; choose another folder with --out")
@@ -47,6 +47,7 @@ def run(options: argparse.Namespace) -> int:
     screen, scene = StageConsole(), scene_seed(options.seed, 0)
     screen.say(f"{options.task}: demonstrations, then a plan and its execution in a new scene (seed {scene})")
     check_server(options.llm)
+    require_keypoints(settings)
     with ExitStack() as stack:
         with screen.stage("simulator"):
             task: Task = stack.enter_context(closing(make_task(options.task)))

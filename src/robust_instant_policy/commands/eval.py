@@ -14,6 +14,7 @@ from robust_instant_policy.commands.options import (
     method_settings,
     natural,
     positive,
+    require_keypoints,
     seed,
 )
 from robust_instant_policy.evaluation import (
@@ -87,8 +88,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     sets = range(options.first_set, options.first_set + options.sets)
     first_demonstration_seed(sets[-1])  # refuses more sets than there are before anything is recorded
+    settings = method_settings(options)
     base = Variant.of(
-        method_settings(options),
+        settings,
         demos=options.demos,
         queries=options.queries,
         model=model_name(options.llm),
@@ -129,6 +131,7 @@ def run(options: argparse.Namespace) -> int:
     asks = any(variant.method in ASKING_METHODS for suite in suites for variant in suite.variants)
     if asks and not options.replay and not (options.out / STORE_FILE).exists():  # which may hold all the answers
         check_server(options.llm)
+        require_keypoints(settings)
     screen = StageConsole()
     progress = _progress(screen, options.out)
     with screen.stage("evaluation"):

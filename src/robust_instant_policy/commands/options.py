@@ -4,7 +4,9 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from robust_instant_policy.perception.network import require_features
+from robust_instant_policy.perception import CORRESPONDENCES
+from robust_instant_policy.perception.network import require_features, require_weights
+from robust_instant_policy.plugins import load_class
 from robust_instant_policy.policies.settings import CONFIGS, WORDS, Settings
 from robust_instant_policy.tasks.level import LEVELS, PAPER
 from robust_instant_policy.tasks.task import bounded_seed
@@ -131,6 +133,15 @@ def method_settings(options: argparse.Namespace) -> Settings:
     names = ("features", "keypoints", "frames", "layout", "downsampling", "estimator")
     given = {name: getattr(options, name) for name in names}
     return Settings.of(options.config).changed(**{name: value for name, value in given.items() if value is not None})
+
+
+def require_keypoints(settings: Settings) -> None:
+    """Raises `ModelError` where the keypoints of ``settings`` need weights that cannot be had, `UsageError` for a
+    source that does not exist; to call before long work."""
+    if settings.keypoints in CORRESPONDENCES:
+        require_weights(settings.features)
+    elif isinstance(settings.keypoints, str):
+        load_class("keypoints", settings.keypoints)
 
 
 def beside(folder: Path, ending: str) -> Path:

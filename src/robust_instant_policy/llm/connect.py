@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import cast
 from urllib.parse import urlsplit
 
-from robust_instant_policy.errors import UsageError
-from robust_instant_policy.llm.model import LanguageModel
+from robust_instant_policy.errors import ModelError, UsageError
+from robust_instant_policy.llm.model import NO_FILE, LanguageModel
 
 FORMS = "'embedded', 'gguf:PATH', 'openai:MODEL', 'http://HOST:PORT/v1#MODEL'"
 OPENAI_URL = "https://api.openai.com/v1"
@@ -38,9 +38,14 @@ def model_name(spec: str) -> str:
 def check_server(spec: str) -> None:
     """One short request where ``spec`` names a server, to report a wrong address, key or model before long work.
 
-    Raises `UsageError` as `connect` does, `ModelError` where the server cannot be used.
+    Raises `UsageError` as `connect` does, `ModelError` where the server cannot be used, or a model file is missing.
     """
-    if spec == "embedded" or spec.startswith("gguf:"):
+    kind, _, rest = spec.partition(":")
+    if kind == "gguf" and rest:
+        if not (path := Path(rest).expanduser()).is_file():
+            raise ModelError(NO_FILE.format(path))
+        return
+    if spec == "embedded":
         return
     from robust_instant_policy.llm.endpoint import Endpoint
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from robust_instant_policy.errors import MissingExtraError, ModelError
-from robust_instant_policy.llm.model import NOBODY, Listener, Sampling, Tally, context_error, sample_seed
+from robust_instant_policy.llm.model import NO_FILE, NOBODY, Listener, Sampling, Tally, context_error, sample_seed
 from robust_instant_policy.llm.reply import CUT_OFF, whole_numbers
 from robust_instant_policy.query import Answer, Query
 
@@ -103,7 +103,7 @@ class LlamaModel:
 
     def __init__(self, path: Path, name: str, context_length: int | None = None):
         if not path.is_file():
-            raise ModelError(f"no model file at {path}; give the path of a .gguf file")
+            raise ModelError(NO_FILE.format(path))
         self._path = path
         self.name = name
         self._layout: _Layout | None = None

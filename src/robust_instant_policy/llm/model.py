@@ -17,6 +17,8 @@ Accept = Callable[[int, str], Any]  # query index, text -> parsed value; None or
 OnProgress = Callable[[int, int], None]  # accepted answers, wanted answers
 OnAnswer = Callable[[int, int, int, Answer, bool], None]  # query index, sample index, attempt, answer, accepted
 
+NO_FILE = "no model file at {}; give the path of a .gguf file"
+
 
 @dataclass(frozen=True)
 class Sampling:

@@ -49,6 +49,19 @@ def require_features(features: str) -> None:
         require_source(features)
 
 
+def require_weights(features: str, model: str = DescriptorSettings.model) -> None:
+    """Raises `ModelError` where `choose_network` would find no weights for ``features``; to call before long work.
+
+    Fetches those that the hub has and that are not on this machine.
+    """
+    local = os.environ.get(WEIGHTS_VARIABLE)
+    source = (local or model) if features == "dino" else features
+    if source not in ("auto", "efficientnet"):
+        from robust_instant_policy.perception.vit_checkpoint import obtain
+
+        obtain(source)
+
+
 def resolve_features(features: str, model: str = DescriptorSettings.model) -> str:
     """``features``, with ``"auto"`` replaced by what `choose_network` takes for it with the settings' ``model``."""
     if features != "auto":

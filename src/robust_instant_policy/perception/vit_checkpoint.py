@@ -36,16 +36,23 @@ def load_checkpoint(source: str) -> VitCheckpoint:
     connection the error comes within seconds. What the hub sent is checked at every use (`_checked`). Raises
     `ModelError`, one line, and `MissingExtraError`.
     """
+    path = obtain(source)
+    return _from_file(path) if path.is_file() else _from_folder(path)
+
+
+def obtain(source: str) -> Path:
+    """The folder or file with the weights of ``source``, as for `load_checkpoint`; fetches what the hub has.
+
+    Raises `ModelError`, one line, and `MissingExtraError`. Loads nothing.
+    """
     for package in ("torch", "transformers", "safetensors"):
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(package, "vision")
     require_source(source)
     path = Path(source).expanduser()
-    if path.is_dir():
-        return _from_folder(path)
-    if path.is_file():
-        return _from_file(path)
-    return _from_folder(_checked(cached_folder(source) or _download(source)))
+    if path.is_dir() or path.is_file():
+        return path
+    return _checked(cached_folder(source) or _download(source))
 
 
 def require_source(source: str) -> None:

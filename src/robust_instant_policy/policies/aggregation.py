@@ -27,6 +27,7 @@ from robust_instant_policy.trajectory import Trajectory
 
 DISTANCES = {"envelope: position", "envelope: step length", "envelope: path length"}  # the limits that frames excuse
 FARTHEST = 0.5  # of the longest side of the envelope's box, from what was demonstrated; no frame supports more
+STRAY_M = 0.05  # from the demonstrations carried over: a plan that strays farther does not do what they do
 CARRIED_NOTE = "{}; the demonstrations carried over into this scene do the same"
 
 
@@ -83,15 +84,19 @@ def agree(
 def _outside(context: Context, keypoints: FloatArray, trajectory: Trajectory) -> tuple[Finding, ...]:
     """What of ``trajectory`` lies outside of what was demonstrated: an error, or a warning where frames explain it.
 
-    They do where the demonstrations, as their frames carry them over into the scene of ``keypoints (K, 3)``, lie
-    outside as well, because things are farther apart there. That excuses `DISTANCES` alone, and places outside by
-    `FARTHEST` at most; never a low fingertip, a turn or another gripper change.
+    They do where it follows the demonstrations, as their frames carry them over into the scene of ``keypoints (K, 3)``,
+    at every step to `STRAY_M`, and these lie outside as well, because things are farther apart there. That excuses
+    `DISTANCES` alone, and places outside by `FARTHEST` at most; never a low fingertip, a turn or another gripper
+    change.
     """
     envelope, prompt = context.report.envelope, context.prompt.for_scene(keypoints)
     found = envelope.check(trajectory) if envelope is not None else ()
     if envelope is None or not found or not isinstance(prompt, FactorisedPrompt):
         return found
-    there = Envelope.of(prompt.carried_over(keypoints, len(prompt.shown)), envelope.plane)
+    carried = prompt.carried_over(keypoints, len(prompt.shown))
+    if _strays(trajectory, carried):
+        return found
+    there = Envelope.of(carried, envelope.plane)
     unlike = {finding.kind for finding in there.check(trajectory)}
     farthest = FARTHEST * float((envelope.upper - envelope.lower).max())
     if any(one.kind == "envelope: position" and one.numbers["value"] > farthest for one in found):
@@ -102,6 +107,15 @@ def _outside(context: Context, keypoints: FloatArray, trajectory: Trajectory) ->
         else one
         for one in found
     )
+
+
+def _strays(trajectory: Trajectory, carried: Sequence[Trajectory]) -> bool:
+    """Whether a point of ``trajectory`` is farther than `STRAY_M` from those of the ``carried`` demonstrations at the
+    same step, along an axis of the world."""
+    if any(one.actions.shape != trajectory.actions.shape for one in carried):
+        return True
+    points, shown = trajectory.triplets, np.stack([one.triplets for one in carried])
+    return bool(np.maximum(shown.min(axis=0) - points, points - shown.max(axis=0)).max() > STRAY_M)
 
 
 def make_plan(

@@ -1,5 +1,6 @@
 """Keypoints of one's own: from a tracker, fiducial markers or a pose estimator."""
 
+import reprlib
 from collections.abc import Callable, Sequence
 from typing import Protocol, Self, runtime_checkable
 
@@ -80,6 +81,8 @@ class OwnKeypoints:
             raise KeypointError(f"the keypoints {self.name} raise {type(error).__name__}: {error}") from error
 
     def _require_all(self, keypoints: FloatArray, where: str) -> None:
+        if not len(keypoints):
+            raise KeypointError(f"the keypoints {self.name} give no point in {where}")
         missing = np.flatnonzero(~np.isfinite(keypoints).all(axis=1))
         if len(missing):
             raise KeypointError(f"the keypoints {self.name} do not find {missing.tolist()} in {where}")
@@ -94,10 +97,10 @@ def _separated(found: Points, ndim: int) -> tuple[FloatArray, FloatArray]:
     if confidence is None:
         return keypoints, np.ones(keypoints.shape[:-1])
     chance = as_numbers("confidence", confidence)
-    if chance.shape != keypoints.shape[:-1] or not ((chance >= 0) & (chance <= 1)).all():
-        raise InvalidValueError(
-            f"the confidence of keypoints must be {keypoints.shape[:-1]} in [0, 1], got {chance.shape}"
-        )
+    if chance.shape != keypoints.shape[:-1]:
+        raise InvalidValueError(f"the confidence of keypoints must be {keypoints.shape[:-1]}, got {chance.shape}")
+    if not ((chance >= 0) & (chance <= 1)).all():
+        raise InvalidValueError(f"the confidence of keypoints must lie in [0, 1], got {reprlib.repr(chance.tolist())}")
     return keypoints, chance
 
 

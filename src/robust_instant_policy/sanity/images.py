@@ -7,7 +7,7 @@ import numpy as np
 from robust_instant_policy.demonstration import Demonstration
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.sanity.consistency import MIN_DEMONSTRATIONS
-from robust_instant_policy.sanity.contact import GripperPath
+from robust_instant_policy.sanity.contact import Contact, GripperPath
 from robust_instant_policy.sanity.finding import Finding, Severity, errors
 from robust_instant_policy.sanity.geometry import (
     BELOW_TABLE_M,
@@ -169,10 +169,10 @@ def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
     """Single demonstrations whose path does not fit their image while the others' do.
 
     What most do is no contradiction: one may reach as low as they do, as into a hole of which its image shows less.
-    Where most reach below the table, as into a hole, one that reaches deeper is only told.
+    Where most reach below the table, as into a hole, one that reaches deeper is only told, and so is one of two.
     """
     if len(views) < MIN_DEMONSTRATIONS:
-        return []
+        return _one_of_two(views, as_is)
     likeness = as_is.surroundings.likeness
     usual = float(np.median(likeness))
     usual_height = float(np.median([c.least_height for c in as_is.contacts]))
@@ -185,18 +185,33 @@ def _outliers(views: Sequence[View], as_is: Evidence) -> list[Finding]:
         below = c.least_height < low and not is_above(c, view)
         if not (unlike or apart or below or c.buried > max(BURIED_M, deep)):
             continue
-        gap = f"its path comes no nearer than {c.path * 1e3:.0f} mm to a surface"
-        if not len(view.raised_points):
-            gap = "its image shows nothing above the table"
         words = (
-            f"demonstration {index} contradicts the others: {gap}, its lowest fingertip is {c.lowest * 1e3:.0f} mm "
-            "above the table, and it is "
+            f"demonstration {index} contradicts the others: {_gap(c, view)}, its lowest fingertip is "
+            f"{c.lowest * 1e3:.0f} mm above the table, and it is "
             f"{likeness[index]:.2f} like the others ({usual:.2f}); look at it, and remove it if it is wrong"
         )
         severity: Severity = "error" if apart or (below and not into_hole and likeness[index] < ALIKE) else "warning"
         numbers = {"demonstration": float(index), "path_gap": c.path, "likeness": float(likeness[index])}
         found.append(Finding("contradiction", severity, words, numbers, f"demonstration {index}"))
     return found
+
+
+def _one_of_two(views: Sequence[View], as_is: Evidence) -> list[Finding]:
+    """The one of two demonstrations whose path meets nothing in its image while the other's does."""
+    far = [index for index, c in enumerate(as_is.contacts) if c.path > FAR_FROM_ALL_M]
+    if len(views) != 2 or len(far) != 1:
+        return []
+    (index,) = far
+    c = as_is.contacts[index]
+    words = f"demonstration {index} fits its image worse than the other one: {_gap(c, views[index])}; look at it"
+    numbers = {"demonstration": float(index), "path_gap": c.path}
+    return [Finding("contradiction", "warning", words, numbers, f"demonstration {index}")]
+
+
+def _gap(contact: Contact, view: View) -> str:
+    if not len(view.raised_points):
+        return "its image shows nothing above the table"
+    return f"its path comes no nearer than {contact.path * 1e3:.0f} mm to a surface"
 
 
 def scene_spread(views: Sequence[View]) -> float:

@@ -138,7 +138,8 @@ class Scenery:
         change = np.abs(np.stack([view.rgb for view in views]) - rgb).max(axis=-1)
         steady = static & ((change < COLOUR_CHANGE).mean(axis=0) >= STATIC)
         bare = cls(views[0].observation, depth, rgb, static, steady, float("nan"), 1.0)
-        if len(views) < 3:  # a median of two is neither
+        copies = all(np.array_equal(view.rgb, views[0].rgb) for view in views[1:])  # say nothing of the camera's noise
+        if len(views) < 3 or copies:  # a median of two is neither
             return bare
         own = [bare.likeness(view) for view in views]
         texture = float(np.nanmin(values)) if np.isfinite(values := [o.texture for o in own]).any() else float("nan")
