@@ -12,6 +12,7 @@ from robust_instant_policy.perception import KeypointExtractor, matching
 from robust_instant_policy.perception.keypoints import _expected_places
 from robust_instant_policy.perception.relevance import relevances
 from robust_instant_policy.perception.view import make_view
+from robust_instant_policy.policies import Neighbours
 from robust_instant_policy.policies.context import build_context
 from robust_instant_policy.policies.settings import Settings
 from robust_instant_policy.reporting.keypoints import keypoints_page
@@ -482,3 +483,22 @@ def test_the_context_holds_the_demonstrations_that_show_the_grasped_thing():
     assert np.isin(
         demonstrations[4].trajectory.actions[-1, :3].round(3), context.trajectories[3].actions.round(3)
     ).all()
+
+
+def test_a_plan_for_a_thing_that_only_takes_the_place_of_the_one_that_is_meant_passes_no_gate():
+    demonstrations = []
+    for seed in range(6):
+        ((x, y),) = places(seed, 1)
+        path = path_to(x, y)
+        actions = path.actions + [0, 0, 0, 0, 0.02, 0, 0, -0.02, 0, 0]
+        seen = photograph([(x, y, 0.03, 0.05, COLOURS[0])])
+        demonstrations.append(Demonstration(seen, Trajectory(actions, path.times), 10.0, "task", seed))
+    policy = Neighbours(Settings(features="efficientnet", num_keypoints=6)).fit(demonstrations)
+    meant, other = places(10, 2)
+    paler = tuple(tuple(np.add(colour, 20).clip(0, 255)) for colour in COLOURS[0])
+    alone = policy.plan(photograph([(*meant, 0.03, 0.05, COLOURS[0])]))
+    beside = policy.plan(photograph([(*meant, 0.03, 0.05, paler), (*other, 0.03, 0.07, COLOURS[0])]))
+    assert np.linalg.norm(beside.keypoints[:, :2].mean(axis=0) - other) < 0.03
+    assert alone.confidence > 0.9
+    assert beside.confidence < 0.6
+    assert any("of the confidence that counts as recognised" in note for note in beside.notes)
