@@ -490,7 +490,7 @@ def test_a_plan_for_a_thing_that_only_takes_the_place_of_the_one_that_is_meant_p
     for seed in range(6):
         ((x, y),) = places(seed, 1)
         path = path_to(x, y)
-        actions = path.actions + [0, 0, 0, 0, 0.02, 0, 0, -0.02, 0, 0]
+        actions = np.add(path.actions, [0, 0, 0, 0, 0.02, 0, 0, -0.02, 0, 0])
         seen = photograph([(x, y, 0.03, 0.05, COLOURS[0])])
         demonstrations.append(Demonstration(seen, Trajectory(actions, path.times), 10.0, "task", seed))
     policy = Neighbours(Settings(features="efficientnet", num_keypoints=6)).fit(demonstrations)

@@ -101,6 +101,7 @@ class Environment:
 
     def scene_truth(self) -> SceneTruth:
         """Bodies and goal sites at the pixels of the camera, and their poses."""
+        self._place_goals()
         seen, kind = np.moveaxis(self._images.segmentation(_camera(), SIZE_PX), -1, 0)
         model, data = self.model, self.data
         parts = np.full(seen.shape, -1)
@@ -115,6 +116,7 @@ class Environment:
 
     def video_frame(self) -> Image:
         """A frame of one of the benchmark's own cameras, with the robot."""
+        self._place_goals()
         options = mujoco.MjvOption()
         options.geomgroup[HIDDEN_GROUP] = 1
         return self._images.rgb(FILM_CAMERA, FILM_PX, options)
