@@ -36,7 +36,7 @@ BLENDING_S = 0.5  # time in which the difference between measured joints and the
 START_RAD = 0.1  # largest such difference
 Step = tuple[float, Sequence[Command], Sequence[ArmState]]  # time, what was sent, and the states after it
 HOLDING = "the arms hold their position"
-EMULATED_STALE_S = 0.5, 0.2  # greatest age of a state, at pace 1 and at any pace: an emulation shares the processor
+EMULATED_STALE_S = 0.5, 0.4  # greatest age of a state, at pace 1 and at any pace: emulations share a busy processor
 
 
 @dataclass(frozen=True)
