@@ -14,7 +14,7 @@ ROOT = Path(robust_instant_policy.__file__).parent
 PACKAGE = "robust_instant_policy"
 FLOORS = {
     "errors": 1, "checks": 1, "geometry": 1, "trajectory": 1, "demonstration": 1, "query": 1, "files": 1,
-    "controller": 1, "network": 1, "pointcloud": 1, "plugins": 1, "interrupts": 1,
+    "controller": 1, "network": 1, "pointcloud": 1, "plugins": 1, "interrupts": 1, "renamed": 1,
     "perception": 2, "context": 2, "llm": 2, "regression": 2, "datasets": 2, "motion": 2, "sanity": 2,
     "policies": 3, "tasks": 3, "robots": 3,
     "evaluation": 4,

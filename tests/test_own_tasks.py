@@ -11,6 +11,7 @@ from robust_instant_policy.datasets import DatasetWriter, load_demonstrations
 from robust_instant_policy.errors import InvalidValueError, KeypointError, MissingMethodError, UsageError
 from robust_instant_policy.evaluation import read_results
 from robust_instant_policy.geometry import make_pose
+from robust_instant_policy.plugins import load_class
 from robust_instant_policy.policies import Neighbours
 from robust_instant_policy.sanity import errors
 from robust_instant_policy.tasks import Execution, check_task, make_task
@@ -288,6 +289,7 @@ class Given:
         (lambda _: (np.zeros((2, 3)), [0.5, 7.0]), InvalidValueError, r"in \[0, 1\], got \[0.5, 7.0\]"),
         (lambda _: (np.zeros((2, 3)), [0.5] * 3), InvalidValueError, r"must be \(2,\), got \(3,\)"),
         (lambda _: np.zeros((0, 3)), KeypointError, "give no point in demonstration 0"),
+        (lambda _: load_class("camera", "nosuch:Camera"), UsageError, "^camera 'nosuch:Camera'"),  # an own error of rip
     ],
 )
 def test_keypoints_of_ones_own_that_break_their_contract_are_refused(found, error, told):

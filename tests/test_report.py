@@ -1,7 +1,7 @@
 import json
 import os
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -12,9 +12,11 @@ from robust_instant_policy.errors import DatasetError
 from robust_instant_policy.evaluation import Episode, Scene, Variant
 from robust_instant_policy.geometry import GripperTriangle, make_pose
 from robust_instant_policy.policies import Stage, Usage
+from robust_instant_policy.policies.confidence import Evidence
 from robust_instant_policy.reporting.evaluation import Section, evaluation_page
 from robust_instant_policy.reporting.run import (
     CONTEXT_FILE,
+    EVIDENCE,
     PLAN_FILE,
     SEEN_FILE,
     VIDEO_FILE,
@@ -272,3 +274,7 @@ def test_a_pipe_in_the_place_of_a_run_s_file_is_told(run_folder, capsys, name):
     os.mkfifo(run_folder / name)
     assert main(["report", str(run_folder)]) == 1
     assert "named pipe" in capsys.readouterr().err
+
+
+def test_the_report_of_a_run_shows_all_evidence_of_the_confidence():
+    assert EVIDENCE.keys() == {field.name for field in fields(Evidence)}

@@ -3,6 +3,7 @@
 from robust_instant_policy.perception.accuracy import Accuracy, KnownScene, measure
 from robust_instant_policy.perception.keypoints import CORRESPONDENCES, KeypointExtractor, Located
 from robust_instant_policy.perception.settings import PAPER_REAL, PAPER_SIMULATION, DescriptorSettings
+from robust_instant_policy.renamed import renamed
 
 __all__ = [
     "CORRESPONDENCES",
@@ -15,3 +16,5 @@ __all__ = [
     "Located",
     "measure",
 ]
+
+__getattr__ = renamed(__name__, {"keypoints_page": "robust_instant_policy.reporting.keypoints:keypoints_page"})

@@ -159,7 +159,7 @@ class KeypointExtractor:
                 f"{len(self.objects_)} objects were found for {self.num_keypoints} keypoints; {left} of them have none"
             )
         with_keypoints = {i for number in np.flatnonzero(counts) for i in (number, self.objects_[number].model.parent)}
-        # What has no keypoints and is hardly recognised only takes the place of what has.
+        # An object without keypoints that is hardly recognised would only claim points of other objects.
         dropped = [
             number not in with_keypoints and thing.typical_fitness < SAME_THING_FITNESS
             for number, thing in enumerate(self.objects_)
@@ -249,14 +249,14 @@ class KeypointExtractor:
         expected = np.concatenate([_expected_places(view, *triple) for triple in triples])
         counts = [len(places) for places in self._places]
         # An object of another size has its surface further from where it is expected.
-        looseness = np.repeat([OTHER_SIZE if t.model.varies else 1.0 for t in self.objects_], counts)
-        points, pixels, measured = lift_to_surface(view.observation, view.depth, expected, MAX_LIFT_M * looseness)
+        size_factor = np.repeat([OTHER_SIZE if t.model.varies else 1.0 for t in self.objects_], counts)
+        points, pixels, measured = lift_to_surface(view.observation, view.depth, expected, MAX_LIFT_M * size_factor)
         quality = [found.fitness * found.similarity * plausibility(t.model, found, view) for t, _, found in triples]
         confidence = np.repeat(quality, counts)
         confidence *= np.concatenate(
             [certainty(t.model, found, view, places) for t, places, found in triples if len(places)]
         )
-        confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / (RESIDUAL_M * looseness) ** 2)
+        confidence *= np.exp(-((points - expected) ** 2).sum(axis=1) / (RESIDUAL_M * size_factor) ** 2)
         confidence[~measured] /= 2
         notes = list(view.notes)
         for k in np.flatnonzero(~measured):

@@ -20,11 +20,11 @@ from robust_instant_policy.perception.models import (
 from robust_instant_policy.perception.registration import (
     COLOUR_CAP_M,
     Candidates,
-    Loss,
+    Penalty,
     find_rivals,
     fit_shape,
     horizontal_axes,
-    no_loss,
+    no_penalty,
     refine,
     refine_pose,
     rotated,
@@ -112,7 +112,7 @@ def register_model(
         return register(
             model.templates, view, taken, starts, parent=parent.pose, beside=beside, colour_cap=model.colour_cap
         )
-    alone = register(model.templates, view, taken, starts, colour_cap=model.colour_cap, loss=_height_loss(model))
+    alone = register(model.templates, view, taken, starts, colour_cap=model.colour_cap, penalty=_height_penalty(model))
     if model.family:
         family = register(model.family, view, taken, colour_cap=model.colour_cap)
         in_family = register(model.templates, view, taken, family.pose[None], vote=False, colour_cap=model.colour_cap)
@@ -121,10 +121,10 @@ def register_model(
     return _decided(model, alone, view)
 
 
-def _height_loss(model: Model) -> Loss:
+def _height_penalty(model: Model) -> Penalty:
     """What an unusual height takes from the score of an object's motions."""
     around = model.surroundings
-    return no_loss if around is None else lambda motions: RIVAL_SCALE * around.lift_loss(motions)
+    return no_penalty if around is None else lambda motions: RIVAL_SCALE * around.height_penalty(motions)
 
 
 def register(
@@ -136,13 +136,13 @@ def register(
     parent: FloatArray | None = None,
     beside: FloatArray | None = None,
     colour_cap: float = COLOUR_CAP_M,
-    loss: Loss = no_loss,
+    penalty: Penalty = no_penalty,
 ) -> Registration:
     """Find the object of ``templates`` in ``view``, apart from the points near ``taken (T, 3)``, metres, world.
 
     From the motions ``starts (S, 4, 4)``, and unless ``vote`` is false from those of matches. A part also starts from
     turns of the pose ``parent (4, 4)`` of its object, and from matches apart from that object's points
-    ``beside (B, 3)``, and stays near it. ``loss``, see `refine`.
+    ``beside (B, 3)``, and stays near it. ``penalty``, see `refine`.
     """
     target, free = view.target, np.arange(len(view.cell_points))
     if taken is not None and len(taken):
@@ -170,7 +170,7 @@ def register(
         candidates = candidates[np.linalg.norm(travel, axis=1) < MAX_PART_TRAVEL_M]
     index = int(np.argmax([table.max(axis=1).mean() for table in with_foreground]))
     source, similarity = templates[index].xyzrgb, similarity_in(templates, view, similar)
-    refined = refine(candidates, source, target, similarity, view.hides, colour_cap, loss)
+    refined = refine(candidates, source, target, similarity, view.hides, colour_cap, penalty)
     pose = settle_turn(refined.motions[0], source, target, similarity, view.hides, colour_cap)
     return Registration(pose, float(refined.fitness[0]), float(refined.similarity[0]), index, refined.motions[1:])
 

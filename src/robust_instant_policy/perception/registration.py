@@ -66,10 +66,10 @@ MAX_STRETCH = 1.4  # factor, and its inverse
 
 Similarity = Callable[[FloatArray], FloatArray]
 Hidden = Callable[[FloatArray], NDArray[np.bool_]]
-Loss = Callable[[FloatArray], FloatArray]
+Penalty = Callable[[FloatArray], FloatArray]
 
 
-def no_loss(motions: FloatArray) -> FloatArray:
+def no_penalty(motions: FloatArray) -> FloatArray:
     """Of the score of ``motions (C, 4, 4)``: none ``(C,)``."""
     return np.zeros(len(motions))
 
@@ -131,18 +131,18 @@ def refine(
     similarity: Similarity,
     hidden: Hidden,
     cap: float,
-    loss: Loss = no_loss,
+    penalty: Penalty = no_penalty,
 ) -> Candidates:
     """The best candidates after ICP from ``motions (P, 4, 4)``.
 
     ``source (N, 6)`` and ``target (M, 6)`` are XYZRGB points; ``similarity`` is that of the descriptors under each of
-    several motions, ``hidden`` tells which places ``(..., 3)`` of points something hides, ``loss`` what else speaks
+    several motions, ``hidden`` tells which places ``(..., 3)`` of points something hides, ``penalty`` what else speaks
     against motions, of their score. A subset of the points selects `FINALISTS`, all points order them.
     """
     centre = source[:, :3].mean(axis=0)
     starts = np.concatenate([rotated(motion, centre, RESTART_ANGLES) for motion in motions])
     starts, fitness = icp(starts, *_coarse(source, _around(starts, source, target)), COARSE_REACH_M, hidden, cap)
-    score = (fitness + similarity(starts)) / 2 - loss(starts)
+    score = (fitness + similarity(starts)) / 2 - penalty(starts)
     order = np.argsort(-score, kind="stable")
     leading = _distinct(starts, centre, order[score[order] > score.max() - MAX_BEHIND])[:FINALISTS]
     refined = [
@@ -150,7 +150,7 @@ def refine(
     ]
     finalists, fitness = (np.concatenate(parts) for parts in zip(*refined, strict=True))
     similarities = similarity(finalists)
-    order = np.argsort(loss(finalists) - (fitness + similarities) / 2, kind="stable")
+    order = np.argsort(penalty(finalists) - (fitness + similarities) / 2, kind="stable")
     return Candidates(finalists[order], fitness[order], similarities[order])
 
 

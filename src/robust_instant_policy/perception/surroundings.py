@@ -30,7 +30,7 @@ PRIOR_IMAGES = 2  # that counts like this many
 LEAST_DEVIATION = 2.0  # of the logarithm of the chance, added to that over the images
 UNUSUAL_DEVIATIONS = 3.0  # below what is usual, for a confidence of 1/e
 UNUSUAL_LIFT_M = 0.02  # above or below where it usually is, for a confidence of 1/e
-MAX_SIZE_LOSSES = 6.0, 6.0, 12.0  # of the logarithm of the chance, for each axis, and for the height
+MAX_SIZE_PENALTIES = 6.0, 6.0, 12.0  # of the logarithm of the chance, for each axis, and for the height
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,14 +102,14 @@ class Surroundings:
     def log_chance_of(self, states: NDArray[np.int8], sizes: FloatArray) -> FloatArray:
         """The same of ``states (C, n)`` of the cells and `log_sizes` ``(C, 3)``."""
         evidence = self.evidence_of[states, np.arange(len(self.cells))].sum(axis=1) / EVIDENCE_SCALE
-        return np.asarray(evidence - self._size_losses(sizes).sum(axis=1))
+        return np.asarray(evidence - self._size_penalties(sizes).sum(axis=1))
 
-    def lift_loss(self, motions: FloatArray) -> FloatArray:
+    def height_penalty(self, motions: FloatArray) -> FloatArray:
         """What the height at ``motions (C, 4, 4)`` takes from the logarithm of their chance, ``(C,)``."""
-        return self._size_losses(log_sizes(self.axes, motions))[:, 2]
+        return self._size_penalties(log_sizes(self.axes, motions))[:, 2]
 
-    def _size_losses(self, sizes: FloatArray) -> FloatArray:
-        return np.minimum(((sizes - self.sizes[0]) / self.sizes[1]) ** 2 / 2, MAX_SIZE_LOSSES)
+    def _size_penalties(self, sizes: FloatArray) -> FloatArray:
+        return np.minimum(((sizes - self.sizes[0]) / self.sizes[1]) ** 2 / 2, MAX_SIZE_PENALTIES)
 
 
 def log_sizes(axes: FloatArray, motions: FloatArray) -> FloatArray:

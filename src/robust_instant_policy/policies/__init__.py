@@ -33,6 +33,7 @@ from robust_instant_policy.policies.rip import RobustInstantPolicy
 from robust_instant_policy.policies.sampling import Proposal, Samples, propose, sample
 from robust_instant_policy.policies.settings import CONFIGS, Settings
 from robust_instant_policy.policies.training import Training
+from robust_instant_policy.renamed import renamed
 
 __all__ = [
     "ASKING_METHODS",
@@ -71,3 +72,8 @@ __all__ = [
     "sample",
     "scene_of_keypoints",
 ]
+
+__getattr__ = renamed(
+    __name__,
+    {"KeypointContext": f"{__name__}:Settings", "InstantPolicy": f"{__name__}:KeypointActionTokens"},
+)

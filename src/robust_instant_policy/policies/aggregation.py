@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robust_instant_policy.context import FactorisedPrompt
+from robust_instant_policy.context import FactorisedPrompt, Prompt
 from robust_instant_policy.errors import InvalidValueError, PlanningError
 from robust_instant_policy.geometry import FloatArray
 from robust_instant_policy.policies.confidence import (
@@ -26,7 +26,7 @@ from robust_instant_policy.sanity import Envelope, Finding, errors
 from robust_instant_policy.trajectory import Trajectory
 
 DISTANCES = {"envelope: position", "envelope: step length", "envelope: path length"}  # the limits that frames excuse
-FARTHEST = 0.5  # of the longest side of the envelope's box, from what was demonstrated; no frame supports more
+FARTHEST = 0.5  # of the longest side of the envelope's box: a plan farther outside of it is an error
 STRAY_M = 0.05  # from the demonstrations carried over: a plan that strays farther does not do what they do
 CARRIED_NOTE = "{}; the demonstrations carried over into this scene do the same"
 
@@ -81,7 +81,9 @@ def agree(
         raise PlanningError(f"the answers are no trajectories of a gripper: {error}") from None
 
 
-def _outside(context: Context, keypoints: FloatArray, trajectory: Trajectory) -> tuple[Finding, ...]:
+def _outside(
+    envelope: Envelope | None, prompt: Prompt, keypoints: FloatArray, trajectory: Trajectory
+) -> tuple[Finding, ...]:
     """What of ``trajectory`` lies outside of what was demonstrated: an error, or a warning where frames explain it.
 
     They do where it follows the demonstrations, as their frames carry them over into the scene of ``keypoints (K, 3)``,
@@ -89,7 +91,6 @@ def _outside(context: Context, keypoints: FloatArray, trajectory: Trajectory) ->
     `DISTANCES` alone, and places outside by `FARTHEST` at most; never a low fingertip, a turn or another gripper
     change.
     """
-    envelope, prompt = context.report.envelope, context.prompt.for_scene(keypoints)
     found = envelope.check(trajectory) if envelope is not None else ()
     if envelope is None or not found or not isinstance(prompt, FactorisedPrompt):
         return found
@@ -132,9 +133,10 @@ def make_plan(
     is what several candidates agree on.
     """
     trajectory = Trajectory(chosen.actions, chosen.times)
-    outside = _outside(context, scene.keypoints, trajectory)
+    prompt = context.prompt.for_scene(scene.keypoints)
+    outside = _outside(context.report.envelope, prompt, scene.keypoints, trajectory)
     findings = (*context.report.findings, *scene.findings, *outside)
-    frames = context.prompt.for_scene(scene.keypoints).frames
+    frames = prompt.frames
     evidence = Evidence(
         agreement=chosen.confidence,
         vote=context.prompt.decide(scene.keypoints)[1],

@@ -64,13 +64,13 @@ class Evidence:
     that was followed, 0 where either of two may be meant (`Prompt.decide`); how many objects with keypoints are
     ``doubled``: of two alike, it is not known which is meant; whether (1, else 0) the plan is ``carried`` beyond what
     was demonstrated: the demonstrations, carried over into the scene, are so, too; ``recognition`` in [0, 1] of the
-    scene (see `recognition`); ``distortion`` of the distances
-    between keypoints (see `distortion`); ``frames``, metres, the error with which frames that are fitted to the other
-    demonstrations predict one at the gripper change at which they do so worst (`StepFrames.error`), and ``prediction``,
-    that of the demonstrations at the key step at which they predict each other best, which stands in for it without
-    gripper changes; ``novelty``, how far the scene lies from the demonstrations (see `novelty`); ``displacement``,
-    metres, of the plan against what lies around the gripper, and ``precision``, that of the demonstrations
-    (`Surroundings`); how many findings are ``doubts`` about the recording (`doubts`), and ``errors``.
+    scene (see `recognition`); ``distortion`` of the distances between keypoints (see `distortion`); ``frames``, metres,
+    the error with which frames that are fitted to the other demonstrations predict one at the gripper change at which
+    they do so worst (`StepFrames.error`), and ``prediction``, that of the demonstrations at the key step at which they
+    predict each other best, which stands in for it without gripper changes; ``novelty``, how far the scene lies from
+    the demonstrations (see `novelty`); ``displacement``, metres, of the plan against what lies around the gripper, and
+    ``precision``, that of the demonstrations (`Surroundings`); how many findings are ``doubts`` about the recording
+    (`doubts`), and ``errors``.
     """
 
     agreement: float

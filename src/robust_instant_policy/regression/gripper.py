@@ -63,6 +63,8 @@ def robust_gripper_trajectory(
     tolerance: float = TOLERANCE_M,
     curvature: ArrayLike | None = None,
     variation: ArrayLike | None = None,
+    *,
+    bends: ArrayLike | None = None,
 ) -> RobustTrajectory:
     """The robust gripper trajectory of ``candidates``, each ``(T_q, 10·A)``: three points (m) and the state, per arm.
 
@@ -76,11 +78,11 @@ def robust_gripper_trajectory(
     ``tolerance``, metres, is what `RobustTrajectory.confidence` is about. ``curvature (B,)``, metres, is the expected
     standard deviation of the points' second differences (see `StudentTRegression`); only "em" uses it. ``variation
     (V,)``, metres and evenly spread over time, is how far demonstrations differ along the way: a candidate that is off
-    by less is not called hallucinated. The trajectory does not depend on it.
+    by less is not called hallucinated. The trajectory does not depend on it. ``bends`` is the old name of curvature.
     """
     dof, seed = checked_positive("dof", dof, infinite=True), checked_whole("seed", seed)
     check_name("estimator", estimator, ESTIMATORS)
-    tolerance, expected = checked_positive("tolerance", tolerance), checked_curvature(curvature)
+    tolerance, expected = checked_positive("tolerance", tolerance), checked_curvature(curvature, bends)
     usual = None if variation is None else _checked_variation(variation)
     if not isinstance(triangle, GripperTriangle | None):
         raise InvalidValueError(f"triangle must be a GripperTriangle, got {type(triangle).__name__}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -60,7 +61,7 @@ class StudentTRegression:
     the fit independent of the choice of axes; without it each dimension has its own.
     ``curvature (B,)``, evenly spread over time, is the expected standard deviation of a coordinate's second difference
     between steps 1 / (B - 1) apart. Where candidates disagree the curve then goes straight on; where they agree it
-    hardly matters. All dimensions must share one scale for that.
+    hardly matters. All dimensions must share one scale for that. ``bends`` is its old name.
 
     After `fit`: ``knots (K,)``; ``weights``, Q arrays ``(T_q,)`` in [0, 1], at most 1/2 where candidates tie;
     ``log_likelihood``, a value an iteration, never falling; ``converged`` and ``num_iterations``; ``stiffness``, the
@@ -72,10 +73,12 @@ class StudentTRegression:
         dof: float = DEFAULT_DOF,
         groups: ArrayLike | None = None,
         curvature: ArrayLike | None = None,
+        *,
+        bends: ArrayLike | None = None,
     ):
         self.dof = checked_positive("dof", dof, infinite=True)
         self.groups = groups
-        self.curvature = checked_curvature(curvature)
+        self.curvature = checked_curvature(curvature, bends)
 
     def fit(self, candidates: Sequence[ArrayLike], times: Sequence[ArrayLike] | None = None) -> StudentTRegression:
         """Fit to ``candidates``, each ``(T_q, D)``, at ``times``, each ``(T_q,)`` in [0, 1] (evenly spread if None)."""
@@ -132,8 +135,13 @@ class StudentTRegression:
         return interpolate(checked_array("times", times, "(T,)"), self.knots, values)
 
 
-def checked_curvature(curvature: ArrayLike | None) -> FloatArray | None:
-    """``curvature (B,)``, positive and finite."""
+def checked_curvature(curvature: ArrayLike | None, bends: ArrayLike | None = None) -> FloatArray | None:
+    """``curvature (B,)`` or its old name ``bends``, positive and finite."""
+    if bends is not None:
+        warnings.warn("bends is called curvature now; the old name goes in the next version", DeprecationWarning, 3)
+        if curvature is not None:
+            raise UsageError("curvature and its old name bends are both given; give curvature alone")
+        curvature = bends
     if curvature is None:
         return None
     values = checked_array("curvature", curvature, "(B,)")

@@ -220,6 +220,7 @@ EVIDENCE: dict[str, tuple[str, Callable[[float], str]]] = {
     "vote": ("how clear it is which way to act applies", lambda value: f"{value:.2f}"),
     "doubled": ("things with keypoints that a second thing looks like", lambda value: f"{value:.0f}"),
     "carried": ("whether frames carry the plan beyond what was demonstrated", lambda value: "yes" if value else "no"),
+    "recognition": ("how far the scene was recognised, 1 is as in the demonstrations", lambda value: f"{value:.2f}"),
     "frames": ("error with which demonstrations predict a gripper change", lambda value: f"{MM * value:.0f} mm"),
     "prediction": ("error with which they predict a key step at best", lambda value: f"{MM * value:.0f} mm"),
     "distortion": ("change of distances between keypoints, about 1 is usual", lambda value: f"{value:.1f}"),
