@@ -76,9 +76,9 @@ def test_only_a_scene_that_lacks_what_was_demonstrated_is_called_hardly_recognis
     depth[top:bottom, left:right] = np.nanmedian(depth)
     rgb[20:60, 20:26], depth[20:60, 20:26] = (200, 30, 30), np.nanmedian(depth) - 0.1  # another thing
     located = context.extractor.locate(replace(observation, rgb=rgb, depth=depth))
-    missing = replace(
-        scene, located=located, recognition=recognition(context.extractor.confidence_, located.confidence)
-    )
+    extractor = context.extractor
+    recognised = recognition(extractor.confidence_, located.confidence, extractor.object_of_)
+    missing = replace(scene, located=located, recognition=recognised)
     assert HARDLY_RECOGNISED in missing.notes
     plan = Neighbours(SETTINGS).fit_context(context).plan_scene(missing)
     assert plan.confidence <= UNKNOWN
@@ -86,22 +86,29 @@ def test_only_a_scene_that_lacks_what_was_demonstrated_is_called_hardly_recognis
 
 
 def test_a_confidence_that_is_no_number_recognises_nothing():
-    assert recognition(np.ones((3, 4)), np.array([np.nan, np.nan, 1.0, 1.0])) == 0.0
+    assert recognition(np.ones((3, 4)), np.array([np.nan, np.nan, 1.0, 1.0]), np.zeros(4)) == 0.0
 
 
 @pytest.mark.parametrize("count", [2, 4, 10])
 def test_one_hidden_keypoint_is_recognised_and_a_missing_half_is_not(count):
     sure = np.ones((3, count))
-    assert recognition(sure, np.array([0.0, *[1.0] * (count - 1)])) == 1.0
-    assert recognition(sure, np.repeat([0.0, 1.0], [max(2, count // 2), count - max(2, count // 2)])) == 0.0
+    one = np.zeros(count)
+    assert recognition(sure, np.array([0.0, *[1.0] * (count - 1)]), one) == 1.0
+    assert recognition(sure, np.repeat([0.0, 1.0], [max(2, count // 2), count - max(2, count // 2)]), one) == 0.0
+
+
+def test_an_object_of_few_keypoints_must_be_recognised_as_well():
+    sure, object_of = np.ones((3, 10)), np.repeat([0, 1, 2], [7, 2, 1])
+    assert recognition(sure, np.repeat([1.0, 0.1, 1.0], [7, 2, 1]), object_of) < 0.2
+    assert recognition(sure, np.repeat([1.0, 0.0, 1.0, 0.0], [7, 1, 1, 1]), object_of) == 1.0  # one of each is hidden
 
 
 def test_objects_that_demonstrations_recognise_with_little_confidence_may_be_so_in_a_scene():
     sure, unsure = np.full((4, 10), 0.8), np.full((4, 10), 0.4)
-    assert recognition(unsure, np.full(10, 0.35)) == 1
-    assert recognition(sure, np.full(10, 0.35)) < 1
-    assert recognition(unsure, np.full(10, 0.1)) < 0.5
-    assert recognition(sure[:1], np.full(10, 0.35)) == 1  # nothing to compare with
+    assert recognition(unsure, np.full(10, 0.35), np.zeros(10)) == 1
+    assert recognition(sure, np.full(10, 0.35), np.zeros(10)) < 1
+    assert recognition(unsure, np.full(10, 0.1), np.zeros(10)) < 0.5
+    assert recognition(sure[:1], np.full(10, 0.35), np.zeros(10)) == 1  # nothing to compare with
 
 
 def test_rip_and_rip_adaptive_succeed_with_the_embedded_model(demonstrations, context, observation):

@@ -64,9 +64,10 @@ class Ranking:
         return renamed
 
     def margin(self, keypoints: FloatArray) -> float:
-        """The least difference of two things in a scene, in standard deviations of what sorts them."""
+        """The least difference of two things in a scene, in standard deviations of what sorts them; or -inf."""
         values = np.sort(self.values(keypoints), axis=1)
-        return float(np.diff(values, axis=1).min() / values.std())
+        least, deviation = np.diff(values, axis=1).min(), values.std()
+        return float(least / deviation) if deviation else -np.inf  # nothing differs
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.special import expit
@@ -203,15 +204,19 @@ def distortion(demonstrated: FloatArray, keypoints: FloatArray) -> float:
     return float((quartiles(new, shown) / np.maximum(usual, 1.0)).max())
 
 
-def recognition(demonstrated: FloatArray, keypoint_confidence: FloatArray) -> float:
-    """How far a scene was recognised, in [0, 1], from the confidence ``(K,)`` of its keypoints.
+def recognition(demonstrated: FloatArray, keypoint_confidence: FloatArray, object_of: NDArray[np.intp]) -> float:
+    """How far a scene was recognised, in [0, 1], from the confidence ``(K,)`` of its keypoints, and the number of the
+    object of each, ``object_of (K,)``.
 
     Each is compared with the least that it has in the demonstrations, ``demonstrated (I, K)``, of which the first is
     the reference that the others are recognised by; with fewer than two there is nothing to compare, and it is 1. The
-    lower quartile counts: one keypoint may be hidden, but an object that is missing has several.
+    lower quartile counts, of all keypoints and of those of each object that has several; the least of these decides.
+    One keypoint may be hidden, but not an object.
     """
     if len(demonstrated) < 2:
         return 1.0
     least = RECOGNISED * demonstrated[1:].min(axis=0)
     ratio = np.divide(keypoint_confidence, least, out=np.ones_like(keypoint_confidence), where=least > 0)
-    return float(np.clip(np.quantile(np.nan_to_num(ratio), 0.25, method="higher"), 0.0, 1.0))
+    numbers, counts = np.unique(object_of, return_counts=True)
+    parts = [ratio, *(ratio[object_of == number] for number in numbers[counts > 1])]
+    return float(np.clip(min(np.quantile(np.nan_to_num(part), 0.25, method="higher") for part in parts), 0.0, 1.0))

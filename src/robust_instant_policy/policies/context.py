@@ -162,5 +162,6 @@ def locate(context: Context, observation: Observation, progress: Progress = no_p
         findings = context.report.require_observation(observation)
         located = context.extractor.locate(observation)
     extractor = context.extractor
-    recognised = recognition(extractor.confidence_[~extractor.left_out_], located.confidence)
+    shown = extractor.confidence_[~extractor.left_out_]
+    recognised = recognition(shown, located.confidence, extractor.object_of_)
     return LocatedScene(located, watch.stages[0], findings, View.of(observation), recognised)

@@ -61,6 +61,7 @@ class OwnKeypoints:
             self._require_all(points, f"demonstration {index}")
         self.pixels_ = np.stack([_pixels(points, scene) for points, scene in zip(keypoints, scenes, strict=True)])
         self.left_out_: NDArray[np.bool_] = np.zeros(len(scenes), dtype=bool)
+        self.object_of_: NDArray[np.intp] = np.full(keypoints.shape[1], -1)  # not told
         self.notes_ = (f"keypoints: {self.name}, {self.keypoints_.shape[1]} points",)
         return self
 
